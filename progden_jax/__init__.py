@@ -1,0 +1,58 @@
+"""Progressive denoising of Monte Carlo renders in JAX.
+
+A noisy image with its variance goes in, and a mix of it with its denoised version comes out that converges to
+the truth as samples grow (Firmino, Frisvad, Jensen 2022). Images are channels-last, linear radiance.
+"""
+
+__version__ = "0.1.0"
+
+from progden_jax import denoisers, metrics, transfer
+from progden_jax.compilation import enable_compilation_cache
+from progden_jax.denoisers import Denoiser, FunctionDenoiser
+from progden_jax.divergence import (
+    DivergenceEstimate,
+    FiniteDifference,
+    Method,
+    MonteCarlo,
+    divergence,
+    divergence_and_error,
+)
+from progden_jax.exr import ExrError, describe_exr, read_exr, write_exr
+from progden_jax.frame import Frame, Repairs, repair
+from progden_jax.mixing import ClosedForm, Mixer, MixingNet, closed_form_alpha, mixing_features
+from progden_jax.pipeline import Denoised, Result, denoise, progressive_denoise
+from progden_jax.sure import sure
+from progden_jax.tstatistic import t_bound
+
+__all__ = [
+    "ClosedForm",
+    "Denoised",
+    "Denoiser",
+    "DivergenceEstimate",
+    "ExrError",
+    "FiniteDifference",
+    "Frame",
+    "FunctionDenoiser",
+    "Method",
+    "Mixer",
+    "MixingNet",
+    "MonteCarlo",
+    "Repairs",
+    "Result",
+    "closed_form_alpha",
+    "denoise",
+    "denoisers",
+    "describe_exr",
+    "divergence",
+    "divergence_and_error",
+    "enable_compilation_cache",
+    "metrics",
+    "mixing_features",
+    "progressive_denoise",
+    "read_exr",
+    "repair",
+    "sure",
+    "t_bound",
+    "transfer",
+    "write_exr",
+]

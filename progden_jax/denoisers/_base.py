@@ -1,0 +1,59 @@
+"""What a denoiser is to the rest of the library."""
+
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
+
+import jax
+from jaxtyping import Array, Float
+
+from progden_jax.frame import Frame
+
+Bound = Callable[[Float[Array, "h w 3"]], Float[Array, "h w 3"]]
+"""A denoiser of which only the colour is left open: y = f(x)."""
+
+
+@runtime_checkable
+class Denoiser(Protocol):
+    """Anything that turns a frame into a denoised image, differentiably.
+
+    A denoiser that is a pytree with its weights as leaves can be passed through ``jax.jit`` and
+    ``jax.grad``; any other object is treated as a constant. A denoiser whose class sets
+    ``canvas = True`` takes ``bind(frame, valid=(height, width))`` for a frame padded beyond its true
+    size, and then one compiled program serves images of nearby sizes.
+    """
+
+    def __call__(self, frame: Frame) -> Float[Array, "h w 3"]:
+        """The denoised image y, (H, W, 3) linear radiance."""
+        ...
+
+    def bind(self, frame: Frame) -> Bound:
+        """f with y = f(x), x the colour; all else that it needs is taken from `frame` as constants."""
+        ...
+
+
+@jax.tree_util.register_pytree_node_class
+class FunctionDenoiser:
+    """A JAX function of the colour alone as a denoiser: ``FunctionDenoiser(lambda x: ...)``.
+
+    Compiled programs are kept per function object, as by ``jax.jit``: what the function closes over
+    counts as constant. To vary weights, pass ``jax.tree_util.Partial(function, weights)``.
+    """
+
+    def __init__(self, function: Bound) -> None:
+        self.function = jax.tree_util.Partial(function)
+
+    def __call__(self, frame: Frame) -> Float[Array, "h w 3"]:
+        return self.function(frame.color)
+
+    def bind(self, frame: Frame) -> Bound:
+        del frame
+        return self.function
+
+    def tree_flatten(self) -> tuple[tuple[Bound], None]:
+        return (self.function,), None
+
+    @classmethod
+    def tree_unflatten(cls, _: None, children: tuple[Bound]) -> "FunctionDenoiser":
+        denoiser = object.__new__(cls)
+        (denoiser.function,) = children
+        return denoiser

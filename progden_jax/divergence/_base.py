@@ -1,0 +1,84 @@
+"""What every estimator of the divergence shares."""
+
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+Function = Callable[[Float[Array, "h w 3"]], Float[Array, "h w 3"]]
+"""A denoiser bound to everything but the colour."""
+
+
+class Evaluation(NamedTuple):
+    """y = f(x), the estimate of σ²·∂f/∂x and the estimate's standard error, (H, W, 3) each.
+
+    The standard error is 0 where the estimate is exact and inf where one probe cannot tell.
+    """
+
+    value: Float[Array, "h w 3"]
+    divergence: Float[Array, "h w 3"]
+    standard_error: Float[Array, "h w 3"]
+
+
+class Method(Protocol):
+    """An estimator: a frozen object of its settings, hashable, without state."""
+
+    def evaluate(
+        self,
+        f: Function,
+        x: Float[Array, "h w 3"],
+        variance: Float[Array, "h w 3"],
+        key: jax.Array,
+    ) -> Evaluation:
+        """f at `x`, the divergence there and its standard error; arguments are checked already."""
+        ...
+
+
+def accumulate(
+    sample: Callable[[Array], Float[Array, "h w 3"]], count: int, chunk: int, like: Array
+) -> tuple[Array, Array]:
+    """Mean over `count` samples, `sample(index)` each, and that mean's standard error.
+
+    `chunk` samples are in flight at once, so memory does not grow with `count`. Mean and spread are
+    updated as by Chan et al. 1983, which loses no digits when the spread is small.
+    """
+    chunk = min(chunk, count)
+    rest = count % chunk
+
+    def merge(state: tuple[Array, Array, Array], indices: Array) -> tuple[Array, Array, Array]:
+        number, mean, squares = state
+        values = jax.vmap(sample)(indices)
+        new = jnp.asarray(len(indices), like.dtype)
+        new_mean = values.mean(0)
+        new_squares = ((values - new_mean) ** 2).sum(0)
+        step = new_mean - mean
+        total = number + new
+        return (
+            total,
+            mean + step * (new / total),
+            squares + new_squares + step**2 * (number * new / total),
+        )
+
+    zero = jnp.zeros_like(like)
+    state = (jnp.zeros((), like.dtype), zero, zero)
+    full = jnp.arange(count - rest).reshape(-1, chunk)
+    if len(full) == 1:
+        state = merge(state, full[0])
+    else:
+        state, _ = jax.lax.scan(lambda s, i: (merge(s, i), None), state, full)
+    if rest:
+        state = merge(state, jnp.arange(count - rest, count))
+    _, mean, squares = state
+    if count == 1:
+        return mean, jnp.full_like(mean, jnp.inf)
+    spread = squares / (count * (count - 1))
+    positive = spread > 0
+    return mean, jnp.where(positive, jnp.sqrt(jnp.where(positive, spread, 1)), 0)
+
+
+def safe_sqrt(variance: Float[Array, "h w 3"]) -> Float[Array, "h w 3"]:
+    """σ, with derivative 0 where the variance is 0."""
+    positive = variance > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, variance, 1)), 0)

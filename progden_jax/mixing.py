@@ -1,0 +1,166 @@
+"""How much of the denoised image to mix in: α from a network or in closed form."""
+
+import dataclasses
+from typing import Protocol
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from progden_jax import _checks, _windows
+
+FEATURES = 18
+
+
+def mixing_features(
+    x: Float[Array, "h w 3"],
+    y: Float[Array, "h w 3"],
+    variance: Float[Array, "h w 3"],
+    sure: Float[Array, "h w 3"],
+) -> Float[Array, "h w 18"]:
+    """What the mixing network sees of each pixel.
+
+    Returns
+    -------
+    (..., H, W, 18), RGB each: x and y clamped below at 0; arctan of σ², of SURE, of (y − x)², and of
+    SURE + σ² − (y − x)², which is 2σ²f'. Swapping x with y and σ² with SURE swaps the first four
+    and leaves the rest.
+
+    Raises
+    ------
+    ValueError
+        If shapes differ or are not images.
+
+    Notes
+    -----
+    Firmino et al. 2022, section 4.3.
+    """
+    _checks.images("x", x)
+    for name, value in (("y", y), ("variance", variance), ("sure", sure)):
+        _checks.same_shape(name, value, "x", x)
+    squared = (y - x) ** 2
+    return jnp.concatenate(
+        [
+            jnp.maximum(x, 0),
+            jnp.maximum(y, 0),
+            jnp.arctan(variance),
+            jnp.arctan(sure),
+            jnp.arctan(squared),
+            jnp.arctan(sure + variance - squared),
+        ],
+        axis=-1,
+    )
+
+
+def f_act(
+    x1: Float[Array, "..."], x2: Float[Array, "..."], x3: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    """α = clip((x1 − x2) / max(x3, 1e-6), 0, 1), the form of the closed solution (paper, Eq. 19)."""
+    return jnp.clip((x1 - x2) / jnp.maximum(x3, 1e-6), 0, 1)
+
+
+class MixingNet(nn.Module):
+    """The paper's mixing network (section 4.3): features (..., H, W, 18) to α (..., H, W, 3) in [0, 1].
+
+    conv 5×5 to 48 channels, two residual blocks of two 3×3, conv 3×3 to 9, then `f_act` on three
+    groups of three; zero padding throughout; about 108 thousand weights.
+    """
+
+    width: int = 48
+
+    def setup(self) -> None:
+        self.conv_in = nn.Conv(self.width, (5, 5), padding="SAME")
+        self.block1_conv1 = nn.Conv(self.width, (3, 3), padding="SAME")
+        self.block1_conv2 = nn.Conv(self.width, (3, 3), padding="SAME")
+        self.block2_conv1 = nn.Conv(self.width, (3, 3), padding="SAME")
+        self.block2_conv2 = nn.Conv(self.width, (3, 3), padding="SAME")
+        self.conv_out = nn.Conv(9, (3, 3), padding="SAME")
+
+    def __call__(self, features: Float[Array, "*b h w 18"]) -> Float[Array, "*b h w 3"]:
+        _checks.images("features", features, channels=FEATURES)
+        h = nn.relu(self.conv_in(features))
+        for first, second in (
+            (self.block1_conv1, self.block1_conv2),
+            (self.block2_conv1, self.block2_conv2),
+        ):
+            h = nn.relu(h + second(nn.relu(first(h))))
+        x1, x2, x3 = jnp.split(self.conv_out(h), 3, axis=-1)
+        return f_act(x1, x2, x3)
+
+
+def closed_form_alpha(
+    x: Float[Array, "h w 3"],
+    y: Float[Array, "h w 3"],
+    variance: Float[Array, "h w 3"],
+    divergence: Float[Array, "h w 3"],
+    *,
+    window: int = 15,
+) -> Float[Array, "h w 3"]:
+    """α = σ²(1 − f') / (y − x)², both averaged over a window per channel, clipped to [0, 1].
+
+    The mix of least expected squared error where α is constant over the window; 0 where y equals x throughout
+    it. A ratio of noisy averages: small windows are far too noisy, and where samples are few
+    their variances are too small, so that it keeps too much of the render.
+
+    Parameters
+    ----------
+    x, y, variance, divergence : (H, W, 3), see `sure`. Padding around the image must have zero variance
+        and y = x.
+    window : odd width in pixels.
+
+    Notes
+    -----
+    Firmino et al. 2022, Eq. 9.
+    """
+    _checks.image("x", x)
+    for name, value in (("y", y), ("variance", variance), ("divergence", divergence)):
+        _checks.same_shape(name, value, "x", x)
+    _checks.odd_int("window", window)
+    numerator = _windows.box_sum(variance - divergence, window)
+    denominator = _windows.box_sum((y - x) ** 2, window)
+    differs = denominator > 0
+    # Clipping before dividing keeps a tiny denominator from overflowing, in the gradient too.
+    numerator = jnp.clip(numerator, 0, denominator)
+    return jnp.where(differs, numerator / jnp.where(differs, denominator, 1), 0)
+
+
+class Mixer(Protocol):
+    """Anything that gives α from what is known of an image; a pytree, so that it passes through jit."""
+
+    def __call__(
+        self,
+        x: Float[Array, "h w 3"],
+        y: Float[Array, "h w 3"],
+        variance: Float[Array, "h w 3"],
+        divergence: Float[Array, "h w 3"],
+        sure: Float[Array, "h w 3"],
+        *,
+        inside: Bool[Array, "h w 1"] | None = None,
+    ) -> Float[Array, "h w 3"]:
+        """α in [0, 1], (H, W, 3). `inside` is False where the arrays are padding around the image."""
+        ...
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class ClosedForm:
+    """The mixer that needs no weights: `closed_form_alpha` over a window of this width."""
+
+    window: int = 15
+
+    def __post_init__(self) -> None:
+        _checks.odd_int("window", self.window)
+
+    def __call__(
+        self,
+        x: Float[Array, "h w 3"],
+        y: Float[Array, "h w 3"],
+        variance: Float[Array, "h w 3"],
+        divergence: Float[Array, "h w 3"],
+        sure: Float[Array, "h w 3"],
+        *,
+        inside: Bool[Array, "h w 1"] | None = None,
+    ) -> Float[Array, "h w 3"]:
+        del sure, inside
+        return closed_form_alpha(x, y, variance, divergence, window=self.window)

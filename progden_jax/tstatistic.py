@@ -1,0 +1,86 @@
+"""The confidence bound on α that makes the mix converge to the truth."""
+
+import math
+
+import jax.numpy as jnp
+from jax import nn
+from jax.scipy import special
+from jaxtyping import Array, Bool, Float
+
+from progden_jax import _checks, _windows
+
+_SIGMOIDS = {"normal": special.ndtr, "logistic": nn.sigmoid}
+
+
+def t_bound(
+    alpha: Float[Array, "h w 3"],
+    x: Float[Array, "h w 3"],
+    y: Float[Array, "h w 3"],
+    variance: Float[Array, "h w 3"],
+    *,
+    a: float = 2.0,
+    c: float = 4.2,
+    window: int = 11,
+    sigmoid: str = "normal",
+    mean_variance: Float[Array, ""] | None = None,
+    inside: Bool[Array, "h w 1"] | None = None,
+) -> Float[Array, "h w 3"]:
+    """α lowered where the mix departs from the render by more than its noise explains.
+
+    Parameters
+    ----------
+    alpha : (H, W, 3) in [0, 1], the mixing weight of `y`.
+    x, y, variance : (H, W, 3) noisy and denoised image, and the variance of `x`.
+    a, c : steepness and position of the sigmoid on |t|.
+    window : odd width of the neighbourhood, in pixels.
+    sigmoid : "normal", the standard normal's distribution function, or "logistic".
+    mean_variance : over the whole image, where x is only a tile of it; by default that of `variance`.
+    inside : (H, W, 1) False where the arrays are padding around the image.
+
+    Returns
+    -------
+    (H, W, 3) between 0 and `alpha`. One t per pixel is shared by the channels.
+
+    Raises
+    ------
+    ValueError
+        If shapes differ, the window is even, or the sigmoid is unknown.
+
+    Notes
+    -----
+    Firmino et al. 2022, Eqs. 12 to 18, as in the authors' program: with d = α(y − x), κ a Gaussian of
+    standard deviation s = max(100·sqrt(clip(mean σ², 0, 1)), 1e-3) over s·√(2π), and M_c the
+    window's pixel of highest variance, t = |Σκd + ⅓Σ_c d_M| / (sqrt(Σκ²σ² + ⅑Σ_c σ²_M) + 1e-6). The
+    paper divides nothing by 3, which is its only difference but for a mean over channels.
+    """
+    _checks.image("x", x)
+    for name, value in (("alpha", alpha), ("y", y), ("variance", variance)):
+        _checks.same_shape(name, value, "x", x)
+    _checks.odd_int("window", window)
+    _checks.choice("sigmoid", sigmoid, _SIGMOIDS)
+
+    difference = alpha * (y - x)
+    if mean_variance is None:
+        pixels = x.shape[0] * x.shape[1] if inside is None else jnp.maximum(inside.sum(), 1)
+        mean_variance = variance.sum() / (3 * pixels)
+    clipped = jnp.clip(jnp.asarray(mean_variance, x.dtype), 0, 1)
+    scale = jnp.maximum(100 * _safe_sqrt(clipped), 1e-3)
+    height = 1 / (scale * math.sqrt(2 * math.pi))
+
+    # Zero outside for the sums, and out of reach for the maximum.
+    candidates = variance if inside is None else jnp.where(inside, variance, -jnp.inf)
+    highest, difference_there = _windows.argmax_payload(candidates, difference, window)
+    if inside is not None:
+        highest = jnp.where(inside, highest, 0)
+    numerator = height * _windows.gaussian_sum(difference.sum(-1), window, 0.5 / scale**2)
+    numerator = numerator + difference_there.sum(-1) / 3
+    noise = height**2 * _windows.gaussian_sum(variance.sum(-1), window, 1 / scale**2)
+    noise = noise + highest.sum(-1) / 9
+    t = jnp.abs(numerator) / (_safe_sqrt(noise) + 1e-6)
+    return alpha * _SIGMOIDS[sigmoid](-a * (t - c))[..., None]
+
+
+def _safe_sqrt(value: Array) -> Array:
+    """sqrt(max(value, 0)) whose derivative at 0 is 0 instead of infinite."""
+    positive = value > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, value, 1)), 0)

@@ -1,0 +1,57 @@
+"""What many tests share: real frames, small random images, and counts of compilations."""
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import progden_jax as pd
+
+DEMO = Path(pd.__file__).parent / "data" / "demo"
+
+
+@pytest.fixture(scope="session")
+def real_frame() -> pd.Frame:
+    """A 128×128 render at 8 samples per pixel, all buffers."""
+    return pd.read_exr(sorted(DEMO.glob("*_000008spp.exr"))[0])
+
+
+@pytest.fixture
+def images() -> SimpleNamespace:
+    """A random noisy image x (13×18), a smoother y, a variance with zeros, a divergence, float32."""
+    rng = np.random.default_rng(7)
+    x = rng.gamma(1.0, 1.0, (13, 18, 3)).astype(np.float32)
+    variance = (0.1 * x**2 * rng.random(x.shape)).astype(np.float32)
+    variance[rng.random(x.shape[:2]) < 0.2] = 0
+    y = (0.6 * x + 0.4 * x.mean((0, 1))).astype(np.float32)
+    divergence = (variance * rng.normal(0.3, 0.2, x.shape)).astype(np.float32)
+    return SimpleNamespace(x=x, y=y, variance=variance, divergence=divergence)
+
+
+@contextlib.contextmanager
+def counting_compilations() -> Iterator[list[str]]:
+    """The names of the programs compiled within the block."""
+    compiled: list[str] = []
+
+    def listen(event: str, _: float, **details: object) -> None:
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(str(details.get("fun_name", "")))
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        yield compiled
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+
+
+def dense_jacobian_diagonal(f, x: np.ndarray) -> np.ndarray:
+    """∂f_pc/∂x_pc in float64 from the whole Jacobian."""
+    with jax.enable_x64(True):
+        jacobian = jax.jacfwd(f)(jnp.asarray(x, jnp.float64))
+        n = x.size
+        return np.asarray(jnp.diagonal(jacobian.reshape(n, n))).reshape(x.shape)

@@ -1,0 +1,215 @@
+"""Estimators of the divergence against known diagonals, dense Jacobians and their own statistics."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import counting_compilations, dense_jacobian_diagonal
+
+import progden_jax as pd
+from progden_jax.divergence import _random
+
+METHODS = {
+    "differences": pd.FiniteDifference(probes=8, epsilon=1e-2),
+    "rademacher": pd.MonteCarlo(probes=8),
+    "gaussian": pd.MonteCarlo(probes=8, distribution="gaussian"),
+}
+SWEEP = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS.keys())
+
+
+def blur(x):
+    """A linear filter of known diagonal: 0.3 at home, the rest spread over neighbours and channels."""
+    near = sum(jnp.roll(x, shift, axis) for shift in (-1, 1) for axis in (0, 1))
+    return 0.3 * x + 0.1 * near + 0.05 * jnp.roll(x, 1, 2)
+
+
+def curved(x):
+    return jnp.tanh(blur(x)) * (1 + 0.1 * x)
+
+
+@pytest.fixture
+def x():
+    return jnp.asarray(np.random.default_rng(0).gamma(2.0, 0.5, (6, 7, 3)), jnp.float32)
+
+
+@pytest.fixture
+def variance(x):
+    return 0.01 * x**2
+
+
+@SWEEP
+def test_unbiased_within_standard_error(method, x, variance):
+    """The mean over many keys is the exact value within five standard errors, at every pixel."""
+    truth = np.asarray(variance) * dense_jacobian_diagonal(curved, np.asarray(x))
+    keys = jax.random.split(jax.random.key(1), 400)
+    estimates = jax.jit(
+        jax.vmap(lambda key: pd.divergence(curved, x, variance, method=method, key=key))
+    )(keys)
+    estimates = np.asarray(estimates, np.float64)
+    error = estimates.std(0, ddof=1) / np.sqrt(len(keys))
+    assert (np.abs(estimates.mean(0) - truth) < 5 * error + 2e-5 * np.abs(truth)).all()
+    # And the test has power: the standard error is small beside the value.
+    assert np.median(error / np.abs(truth)) < 0.1
+
+
+def test_rademacher_variance_is_the_closed_form(x, variance):
+    """Var = σ_i² Σ_{j≠i} J_ij² σ_j² per probe; Gaussian probes add 2 σ_i⁴ J_ii²."""
+    n = x.size
+    jacobian = np.asarray(jax.jacfwd(curved)(x)).reshape(n, n)
+    sigma2 = np.asarray(variance).ravel()
+    off = jacobian**2 @ sigma2 - np.diag(jacobian) ** 2 * sigma2
+    expected = {
+        "rademacher": sigma2 * off,
+        "gaussian": sigma2 * off + 2 * sigma2**2 * np.diag(jacobian) ** 2,
+    }
+    for distribution, value in expected.items():
+        keys = jax.random.split(jax.random.key(2), 4000)
+        one = pd.MonteCarlo(probes=1, distribution=distribution)
+        samples = jax.jit(
+            jax.vmap(lambda key, one=one: pd.divergence(curved, x, variance, method=one, key=key))
+        )(keys)
+        measured = np.asarray(samples).reshape(len(keys), n).var(0, ddof=1)
+        np.testing.assert_allclose(measured.sum(), value.sum(), rtol=0.03)
+        np.testing.assert_allclose(measured, value, rtol=0.5)
+
+
+@SWEEP
+def test_standard_error_tells_the_spread(method, x, variance):
+    keys = jax.random.split(jax.random.key(3), 300)
+    found = jax.jit(
+        jax.vmap(lambda key: pd.divergence_and_error(curved, x, variance, method=method, key=key))
+    )(keys)
+    spread = np.asarray(found.divergence).var(0, ddof=1).mean()
+    np.testing.assert_allclose((np.asarray(found.standard_error) ** 2).mean(), spread, rtol=0.1)
+
+
+def test_standard_error_of_one_probe_is_unknown(x, variance):
+    found = pd.divergence_and_error(blur, x, variance, method=pd.MonteCarlo(probes=1))
+    assert np.isinf(found.standard_error).all()
+    assert np.isfinite(found.divergence).all()
+
+
+@SWEEP
+def test_jit_vmap_and_chunks_agree_with_the_plain_call(method, x, variance):
+    key = jax.random.key(5)
+    plain = pd.divergence(curved, x, variance, method=method, key=key)
+    jitted = jax.jit(lambda x, v: pd.divergence(curved, x, v, method=method, key=key))(x, variance)
+    np.testing.assert_allclose(jitted, plain, rtol=2e-3, atol=2e-7)
+    batch = jax.vmap(lambda x, v: pd.divergence(curved, x, v, method=method, key=key))(
+        jnp.stack([x, 2 * x]), jnp.stack([variance, variance])
+    )
+    np.testing.assert_allclose(batch[0], plain, rtol=2e-3, atol=2e-7)
+    for chunk in (3, 8):
+        chunked = dataclasses.replace(method, chunk=chunk)
+        other = pd.divergence_and_error(curved, x, variance, method=chunked, key=key)
+        same = pd.divergence_and_error(curved, x, variance, method=method, key=key)
+        np.testing.assert_allclose(other.divergence, same.divergence, rtol=2e-3, atol=2e-7)
+        np.testing.assert_allclose(other.standard_error, same.standard_error, rtol=2e-3, atol=2e-7)
+
+
+@SWEEP
+def test_dtype_is_kept(method, x, variance):
+    assert pd.divergence(blur, x, variance, method=method).dtype == jnp.float32
+    with jax.enable_x64(True):
+        wide = [jnp.asarray(np.asarray(a), jnp.float64) for a in (x, variance)]
+        assert pd.divergence(blur, *wide, method=method).dtype == jnp.float64
+
+
+@SWEEP
+def test_gradient_through_the_divergence(method, x, variance):
+    """SURE as a training loss: derivatives with respect to a denoiser's parameter, in float64."""
+    with jax.enable_x64(True):
+        x, variance = (jnp.asarray(np.asarray(a), jnp.float64) for a in (x, variance))
+
+        def loss(weight):
+            def f(x):
+                return jnp.tanh(weight * blur(x))
+
+            estimate = pd.divergence(f, x, variance, method=method)
+            return pd.sure(x, f(x), variance, estimate).mean()
+
+        gradient = jax.grad(loss)(1.3)
+        difference = (loss(1.3 + 1e-5) - loss(1.3 - 1e-5)) / 2e-5
+        np.testing.assert_allclose(gradient, difference, rtol=1e-5)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e3, 1e6])
+def test_directional_derivatives_do_not_depend_on_scale(scale, x, variance):
+    method = pd.MonteCarlo(probes=4)
+
+    def f(x):  # homogeneous of degree 1
+        return jnp.sqrt(blur(x) ** 2 + x**2)
+
+    expected = pd.divergence(f, x, variance, method=method)
+    scaled = pd.divergence(f, scale * x, scale**2 * variance, method=method)
+    np.testing.assert_allclose(scaled / scale**2, expected, rtol=1e-5)
+
+
+def test_differences_lose_their_probe_where_derivatives_do_not():
+    """At value 10 and σ 1e-3 a step of 1e-4·b is a tenth of float32's spacing: it rounds to nothing."""
+    x = jnp.full((16, 16, 3), 10.0, jnp.float32)
+    variance = jnp.full_like(x, 1e-6)
+    exact = pd.divergence(lambda x: 0.5 * x, x, variance, method=pd.MonteCarlo(probes=1))
+    np.testing.assert_allclose(exact, 0.5 * variance, rtol=1e-5)
+    differences = pd.divergence(lambda x: 0.5 * x, x, variance, method=pd.FiniteDifference())
+    assert float(differences.mean()) < 0.05 * 0.5e-6
+
+
+@pytest.mark.parametrize("draw", [_random.normal, _random.signs])
+def test_random_numbers_belong_to_pixels(draw):
+    key = jax.random.key(4)
+    small = draw(key, 2, jnp.zeros((5, 6, 3)))
+    large = draw(key, 2, jnp.zeros((9, 16, 3)))
+    np.testing.assert_array_equal(large[:5, :6], small)
+    assert not np.array_equal(draw(key, 3, jnp.zeros((5, 6, 3))), small)
+    many = np.asarray(draw(key, 0, jnp.zeros((100, 100, 3))))
+    assert abs(many.mean()) < 5 / np.sqrt(many.size)
+    assert abs((many**2).mean() - 1) < 5 * np.sqrt(2 / many.size)
+
+
+def test_zero_variance_gives_zero_and_finite_gradients(x):
+    nothing = jnp.zeros_like(x)
+    for method in METHODS.values():
+        assert not np.asarray(pd.divergence(curved, x, nothing, method=method)).any()
+        gradient = jax.grad(lambda v, m=method: pd.divergence(curved, x, v, method=m).sum())(
+            nothing
+        )
+        assert np.isfinite(gradient).all()
+
+
+def test_a_pytree_function_compiles_once(x, variance):
+    method = pd.MonteCarlo(probes=3)
+
+    def scaled_blur(weight, x):
+        return weight * blur(x)
+
+    first = pd.divergence(
+        jax.tree_util.Partial(scaled_blur, jnp.float32(1)), x, variance, method=method
+    )
+    second = jax.tree_util.Partial(scaled_blur, jnp.float32(2))
+    with counting_compilations() as compiled:
+        twice = pd.divergence(second, x, variance, method=method)
+    assert compiled == []
+    np.testing.assert_allclose(twice, 2 * first, rtol=1e-5)
+
+
+def test_messages(x, variance):
+    method = pd.MonteCarlo()
+    with pytest.raises(ValueError, match=r"x has shape \(6, 7\), expected \(height, width, 3\)"):
+        pd.divergence(blur, x[..., 0], variance, method=method)
+    with pytest.raises(ValueError, match="variance has shape"):
+        pd.divergence(blur, x, variance[:3], method=method)
+    with pytest.raises(ValueError, match="method is 'exact', expected an estimator"):
+        pd.divergence(blur, x, variance, method="exact")
+    with pytest.raises(ValueError, match="f is a float, expected a function"):
+        pd.divergence(1.0, x, variance, method=method)
+    with pytest.raises(ValueError, match="it must give one image of the same shape"):
+        pd.divergence(lambda x: x[..., :1], x, variance, method=method)
+    with pytest.raises(ValueError, match="probes is 0, expected a whole number of at least 1"):
+        pd.MonteCarlo(probes=0)
+    with pytest.raises(ValueError, match="expected one of 'rademacher', 'gaussian'"):
+        pd.MonteCarlo(distribution="uniform")
+    with pytest.raises(ValueError, match="epsilon is 0, expected a number above 0"):
+        pd.FiniteDifference(epsilon=0)
