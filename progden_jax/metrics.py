@@ -6,10 +6,10 @@ All but FLIP are pure JAX: they compile, map and have finite gradients, at equal
 an image gives a NaN.
 """
 
+import os
 from typing import Any
 
 import dm_pix
-import flip_evaluator
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -223,6 +223,10 @@ def _flip(image: Any, reference: Any) -> tuple[np.ndarray, float]:
     # FLIP finds no exposure for a reference this dark, and would end the process.
     if (truth @ _LUMINANCE).max() < 1.001 * _FLIP_FLOOR:
         settings = dict.fromkeys(("startExposure", "stopExposure"), _FLIP_DARK_EXPOSURE)
+    # FLIP's idle OpenMP threads would else spin, for four times its run time on two cores.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    import flip_evaluator
+
     errors, mean, _ = flip_evaluator.evaluate(
         truth, test, "HDR", applyMagma=False, parameters=settings
     )

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from progden_jax import _checks, _windows
+from progden_jax._numeric import safe_sqrt
 
 FEATURES = 18
 
@@ -96,33 +97,49 @@ def closed_form_alpha(
     divergence: Float[Array, "h w 3"],
     *,
     window: int = 15,
+    confidence: float = 0.0,
 ) -> Float[Array, "h w 3"]:
     """α = σ²(1 − f') / (y − x)², both averaged over a window per channel, clipped to [0, 1].
 
-    The mix of least expected squared error where α is constant over the window; 0 where y equals x throughout
-    it. A ratio of noisy averages: small windows are far too noisy, and where samples are few
-    their variances are too small, so that it keeps too much of the render.
+    The mix of least expected squared error where α is constant over the window. A ratio of noisy averages:
+    small windows are far too noisy, and where samples are few their variances are too small, so that
+    it keeps too much of the render. `confidence` answers the latter: 1 − α is the share of (y − x)² that
+    noise does not explain, E = Σ (y − x)² − σ²(1 − f'), and only what exceeds so many standard errors of E
+    counts as bias of the denoiser. Those errors come from the spread in the window, at most 2σ|y − x| a
+    pixel, which vanishes with the noise: as samples grow both forms agree.
 
     Parameters
     ----------
     x, y, variance, divergence : (H, W, 3), see `sure`. Padding around the image must have zero variance
         and y = x.
     window : odd width in pixels.
+    confidence : standard errors of evidence to ask for before the render is mixed in; 0 is the paper's form.
+
+    Returns
+    -------
+    (H, W, 3) in [0, 1]; 0 where the window has no variance or y equals x throughout it.
 
     Notes
     -----
-    Firmino et al. 2022, Eq. 9.
+    Firmino et al. 2022, Eq. 9; the confidence is this project's, see experiments/main_job.
     """
     _checks.image("x", x)
     for name, value in (("y", y), ("variance", variance), ("divergence", divergence)):
         _checks.same_shape(name, value, "x", x)
     _checks.odd_int("window", window)
-    numerator = _windows.box_sum(variance - divergence, window)
-    denominator = _windows.box_sum((y - x) ** 2, window)
-    differs = denominator > 0
+    squared = (y - x) ** 2
+    excess = squared - (variance - divergence)
+    total, noise = _windows.box_sum(squared, window), _windows.box_sum(variance, window)
+    bias = _windows.box_sum(excess, window)
+    if confidence:
+        pixels = _windows.box_sum(jnp.ones_like(x[..., :1]), window)
+        largest = jnp.maximum(variance, noise / pixels)
+        spread = _windows.box_sum(jnp.minimum(excess**2, 4 * squared * largest), window)
+        bias = bias - confidence * safe_sqrt(spread)
+    usable = (total > 0) & (noise > 0)
     # Clipping before dividing keeps a tiny denominator from overflowing, in the gradient too.
-    numerator = jnp.clip(numerator, 0, denominator)
-    return jnp.where(differs, numerator / jnp.where(differs, denominator, 1), 0)
+    share = jnp.clip(bias, 0, total) / jnp.where(usable, total, 1)
+    return jnp.where(usable, 1 - share, 0)
 
 
 class Mixer(Protocol):
@@ -148,9 +165,14 @@ class ClosedForm:
     """The mixer that needs no weights: `closed_form_alpha` over a window of this width."""
 
     window: int = 15
+    confidence: float = 0.7
 
     def __post_init__(self) -> None:
         _checks.odd_int("window", self.window)
+        if not 0 <= self.confidence < float("inf"):
+            raise ValueError(
+                f"confidence is {self.confidence}, expected a number of standard errors from 0 up."
+            )
 
     def __call__(
         self,
@@ -163,4 +185,6 @@ class ClosedForm:
         inside: Bool[Array, "h w 1"] | None = None,
     ) -> Float[Array, "h w 3"]:
         del sure, inside
-        return closed_form_alpha(x, y, variance, divergence, window=self.window)
+        return closed_form_alpha(
+            x, y, variance, divergence, window=self.window, confidence=self.confidence
+        )

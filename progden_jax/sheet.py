@@ -95,7 +95,7 @@ def draw_sheet(rows: Sequence[Row], reference: Image, *, title: str = "") -> "Fi
         figure, grid, (5, 7), error_norm, "inferno", "absolute error in radiance, mean of R, G, B"
     )
     _text(figure, grid, LEFT, TITLE, title, ha="left", size=18, weight="bold")
-    note = "All pictures at one exposure, all error maps on one logarithmic scale; the least RMSE of a row in bold."
+    note = "All pictures at one exposure, all errors on one scale; the least RMSE of a row in bold."
     _text(figure, grid, LEFT, grid.top(grid.rows) + 14, note, ha="left", size=11, color=FAINT)
     return figure
 
@@ -177,7 +177,7 @@ def _scale(
     bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
     bar.ax.tick_params(labelsize=10, colors=FAINT, length=3)
     if norm.vmax == 1 and norm.vmin == 0:
-        bar.set_ticks([0, 0.5, 1])
+        bar.set_ticks([0, 0.5, 1], labels=["0", "0.5", "1"])
     bar.set_label(label, fontsize=11, color=FAINT)
 
 

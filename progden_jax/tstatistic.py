@@ -8,6 +8,7 @@ from jax.scipy import special
 from jaxtyping import Array, Bool, Float
 
 from progden_jax import _checks, _windows
+from progden_jax._numeric import safe_sqrt
 
 _SIGMOIDS = {"normal": special.ndtr, "logistic": nn.sigmoid}
 
@@ -64,7 +65,7 @@ def t_bound(
         pixels = x.shape[0] * x.shape[1] if inside is None else jnp.maximum(inside.sum(), 1)
         mean_variance = variance.sum() / (3 * pixels)
     clipped = jnp.clip(jnp.asarray(mean_variance, x.dtype), 0, 1)
-    scale = jnp.maximum(100 * _safe_sqrt(clipped), 1e-3)
+    scale = jnp.maximum(100 * safe_sqrt(clipped), 1e-3)
     height = 1 / (scale * math.sqrt(2 * math.pi))
 
     # Zero outside for the sums, and out of reach for the maximum.
@@ -76,11 +77,5 @@ def t_bound(
     numerator = numerator + difference_there.sum(-1) / 3
     noise = height**2 * _windows.gaussian_sum(variance.sum(-1), window, 1 / scale**2)
     noise = noise + highest.sum(-1) / 9
-    t = jnp.abs(numerator) / (_safe_sqrt(noise) + 1e-6)
+    t = jnp.abs(numerator) / (safe_sqrt(noise) + 1e-6)
     return alpha * _SIGMOIDS[sigmoid](-a * (t - c))[..., None]
-
-
-def _safe_sqrt(value: Array) -> Array:
-    """sqrt(max(value, 0)) whose derivative at 0 is 0 instead of infinite."""
-    positive = value > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, value, 1)), 0)

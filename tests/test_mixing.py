@@ -114,17 +114,32 @@ def test_activation_and_its_gradient_at_the_singularity():
         assert all(np.isfinite(g) for g in gradients)
 
 
-def test_closed_form_against_the_definition(images):
+@pytest.mark.parametrize("confidence", [0.0, 1.0])
+def test_closed_form_against_the_definition(images, confidence):
     window, r = 5, 2
     expected = np.zeros_like(images.x, np.float64)
+    largest = images.variance.astype(np.float64)
+    for i in range(13):
+        for j in range(18):
+            around = images.variance[max(i - r, 0) : i + r + 1, max(j - r, 0) : j + r + 1]
+            largest[i, j] = np.maximum(largest[i, j], around.mean((0, 1)))
     for i in range(13):
         for j in range(18):
             area = np.s_[max(i - r, 0) : i + r + 1, max(j - r, 0) : j + r + 1]
             top = (images.variance[area] - images.divergence[area]).sum((0, 1))
             bottom = ((images.y[area] - images.x[area]) ** 2).sum((0, 1))
-            expected[i, j] = np.clip(top / bottom, 0, 1)
+            squared = (images.y[area].astype(float) - images.x[area]) ** 2
+            excess = squared - images.variance[area] + images.divergence[area]
+            error = np.sqrt(np.minimum(excess**2, 4 * squared * largest[area]).sum((0, 1)))
+            bias = bottom - top - confidence * error
+            expected[i, j] = 1 - np.clip(bias / bottom, 0, 1)
     found = pd.closed_form_alpha(
-        images.x, images.y, images.variance, images.divergence, window=window
+        images.x,
+        images.y,
+        images.variance,
+        images.divergence,
+        window=window,
+        confidence=confidence,
     )
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
@@ -151,7 +166,7 @@ def test_closed_form_is_a_weight_with_finite_gradients(seed, level, flat):
     variance = (rng.random(x.shape) * x**2).astype(np.float32)
     divergence = (rng.normal(size=x.shape) * variance).astype(np.float32)
     alpha, gradient = jax.value_and_grad(
-        lambda y: pd.closed_form_alpha(x, y, variance, divergence, window=3).sum()
+        lambda y: pd.closed_form_alpha(x, y, variance, divergence, window=3, confidence=1.0).sum()
     )(y)
     assert np.isfinite(alpha)
     assert np.isfinite(gradient).all()
@@ -159,10 +174,27 @@ def test_closed_form_is_a_weight_with_finite_gradients(seed, level, flat):
     assert ((alpha >= 0) & (alpha <= 1)).all()
 
 
+def test_confidence_vanishes_with_the_noise(images):
+    """With the denoiser's bias fixed, α tends to 0 as the variance does, with and without it."""
+    y = images.x + 0.1
+    for confidence in (0.0, 1.0):
+        means = []
+        for scale in (1.0, 1e-2, 1e-4, 1e-6):
+            variance = scale * (0.1 + images.variance)
+            alpha = pd.closed_form_alpha(
+                images.x, y, variance, 0.1 * variance, window=5, confidence=confidence
+            )
+            means.append(float(alpha.mean()))
+        assert means == sorted(means, reverse=True)
+        assert means[-1] < 0.01
+
+
 def test_messages(images):
     with pytest.raises(ValueError, match="divergence has shape"):
         pd.sure(images.x, images.y, images.variance, images.divergence[:4])
     with pytest.raises(ValueError, match="y has shape"):
         pd.mixing_features(images.x, images.y[:, :4], images.variance, images.variance)
+    with pytest.raises(ValueError, match="confidence is -1, expected a number of standard errors"):
+        pd.ClosedForm(confidence=-1)
     with pytest.raises(ValueError, match="window is 2, expected an odd"):
         pd.ClosedForm(window=2)

@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from progden_jax._numeric import safe_sqrt
+
 Function = Callable[[Float[Array, "h w 3"]], Float[Array, "h w 3"]]
 """A denoiser bound to everything but the colour."""
 
@@ -73,12 +75,4 @@ def accumulate(
     _, mean, squares = state
     if count == 1:
         return mean, jnp.full_like(mean, jnp.inf)
-    spread = squares / (count * (count - 1))
-    positive = spread > 0
-    return mean, jnp.where(positive, jnp.sqrt(jnp.where(positive, spread, 1)), 0)
-
-
-def safe_sqrt(variance: Float[Array, "h w 3"]) -> Float[Array, "h w 3"]:
-    """σ, with derivative 0 where the variance is 0."""
-    positive = variance > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, variance, 1)), 0)
+    return mean, safe_sqrt(squares / (count * (count - 1)))

@@ -6,8 +6,9 @@ import jax
 from jaxtyping import Array, Float
 
 from progden_jax import _checks
+from progden_jax._numeric import safe_sqrt
 from progden_jax.divergence import _random
-from progden_jax.divergence._base import Evaluation, Function, accumulate, safe_sqrt
+from progden_jax.divergence._base import Evaluation, Function, accumulate
 
 
 @jax.tree_util.register_static

@@ -1,0 +1,74 @@
+"""What the experiments share: the data, the machine they ran on, tables."""
+
+import argparse
+import os
+import platform
+from collections.abc import Iterable, Iterator, Sequence
+from importlib.metadata import version
+from pathlib import Path
+
+import jax
+
+import progden_jax as pd
+
+VALID = Path(__file__).resolve().parents[2] / "shared" / "data" / "valid"
+SPP = (2, 8, 32, 128, 512)
+REFERENCE_SPP = 4096
+
+
+def parser(description: str | None) -> argparse.ArgumentParser:
+    """A command line with --data and --scenes; modules add their own."""
+    made = argparse.ArgumentParser(description=description)
+    made.add_argument("--data", type=Path, default=VALID, help="folder of NAME_SSSSSSspp.exr files")
+    made.add_argument("--scenes", type=int, default=None, help="only this many scenes")
+    return made
+
+
+def scenes(folder: Path, most: int | None = None) -> list[str]:
+    """Names of the scenes in a folder of NAME_SSSSSSspp.exr files that have a reference."""
+    found = sorted(
+        p.name[: -len("_000000spp.exr")] for p in folder.glob(f"*_{REFERENCE_SPP:06}spp.exr")
+    )
+    if not found:
+        raise SystemExit(f"{folder} holds no NAME_{REFERENCE_SPP:06}spp.exr: give --data FOLDER.")
+    return found[:most]
+
+
+def series(
+    folder: Path, names: Iterable[str], spp: Sequence[int] = SPP
+) -> Iterator[tuple[str, int, pd.Frame, pd.Frame]]:
+    """(scene, spp, frame, reference) for every file of the named scenes that is there."""
+    for name in names:
+        reference = pd.read_exr(folder / f"{name}_{REFERENCE_SPP:06}spp.exr")
+        for count in spp:
+            path = folder / f"{name}_{count:06}spp.exr"
+            if path.exists():
+                yield name, count, pd.read_exr(path), reference
+
+
+def machine() -> str:
+    """One line on where this runs."""
+    cpu = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        names = {
+            x.split(":", 1)[1].strip()
+            for x in cpuinfo.read_text().splitlines()
+            if "model name" in x
+        }
+        cpu = ", ".join(sorted(names)) or cpu
+    devices = ", ".join(sorted({d.device_kind for d in jax.devices()}))
+    packages = " ".join(f"{name} {version(name)}" for name in ("jax", "jaxlib", "progden_jax"))
+    return (
+        f"{cpu}, {os.cpu_count()} cores, JAX devices: {devices}; "
+        f"Python {platform.python_version()}, {packages}"
+    )
+
+
+def markdown(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A Markdown table."""
+    lines = ["| " + " | ".join(header) + " |", "|" + " --- |" * len(header)]
+    for row in rows:
+        cells = [f"{cell:.4g}" if isinstance(cell, float) else str(cell) for cell in row]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)

@@ -1,0 +1,221 @@
+"""One file from input to output: read, denoise, mix, measure, write."""
+
+import time
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+import progden_jax as pd
+from progden_jax.cli._compare import Scores, compare
+from progden_jax.cli._options import SAVE_ALWAYS, EstimateOptions, NetworkOptions, ReadOptions
+from progden_jax.cli._paths import Item
+from progden_jax.cli._run import Failure
+from progden_jax.exr import ExrInfo, read_exr_with_info, write_exr
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All that holds for every file of a run."""
+
+    read: ReadOptions
+    network: NetworkOptions
+    estimate: EstimateOptions
+    save: tuple[str, ...] = ()
+    half: bool = False
+    force: bool = False
+
+
+@dataclass
+class Outcome:
+    """What became of one file; the fields are the keys of `--json`."""
+
+    input: str
+    output: str
+    ok: bool = False
+    error: str | None = None
+    mode: str | None = None
+    width: int | None = None
+    height: int | None = None
+    spp: float | None = None
+    variance: str | None = None
+    denoiser: str | None = None
+    auxiliary: tuple[str, ...] = ()
+    method: str | None = None
+    mean_alpha: float | None = None
+    mean_sure: float | None = None
+    repairs: dict[str, int] = field(default_factory=dict)
+    metrics: Scores | None = None
+    seconds: float | None = None
+    warnings: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def line(self) -> str:
+        """What was done, for people."""
+        facts = [f"{self.width}×{self.height}"]
+        if self.spp is not None:
+            facts.append(f"{self.spp:g} spp")
+        facts.append(f"{self.denoiser} ({' + '.join(('colour', *self.auxiliary))})")
+        if self.mean_alpha is None:
+            facts.append("denoised plainly")
+        else:
+            facts.append(f"mean α {self.mean_alpha:.2f}")
+        facts.append(f"{self.seconds:.1f} s")
+        text = f"{self.input} → {self.output}: {', '.join(facts)}"
+        bad = [f"{n} {_REPAIRS[name]}" for name, n in self.repairs.items() if n]
+        return text + (f"; bad pixels: {', '.join(bad)}" if bad else "")
+
+
+_REPAIRS = {
+    "nonfinite_color": "with NaN or infinite colour (filled in)",
+    "negative_color": "with negative colour (kept)",
+    "nonfinite_variance": "with NaN or infinite variance (filled in)",
+    "negative_variance": "with negative variance (set to 0)",
+    "nonfinite_auxiliary": "with NaN or infinite albedo, normal or depth (set to 0)",
+}
+
+
+class _Images(NamedTuple):
+    """What a run gives: `maps` are the layers that `--save` can ask for."""
+
+    image: np.ndarray
+    frame: pd.Frame
+    maps: dict[str, np.ndarray]
+
+
+def process(item: Item, settings: Settings, outcome: Outcome) -> None:
+    """Denoise one file, filling in `outcome` as things become known.
+
+    Raises
+    ------
+    ValueError
+        What cannot be read, denoised or written; nothing is left at the output then.
+    """
+    start = time.perf_counter()
+    read = settings.read.settings(item.variance_from, auxiliary=not settings.network.no_aux)
+    frame, info = read_exr_with_info(item.input, **read)
+    outcome.height, outcome.width = frame.size
+    outcome.spp, outcome.variance = info.spp, info.variance
+    outcome.warnings += info.warnings
+    outcome.notes += info.notes
+    reference = None if item.reference is None else _reference(item, frame, outcome)
+    frame = _with_usable_variance(frame, info, outcome)
+    frame, denoiser = settings.network.load(frame)
+    outcome.denoiser, outcome.auxiliary = denoiser.name, denoiser.inputs
+    images = _denoise(frame, denoiser, settings.estimate, outcome)
+    if reference is not None:
+        outcome.metrics = _measure(images, reference)
+    _write(item, images, info, settings, outcome)
+    outcome.seconds = round(time.perf_counter() - start, 3)
+    outcome.ok = True
+
+
+def _with_usable_variance(frame: pd.Frame, info: ExrInfo, outcome: Outcome) -> pd.Frame:
+    if frame.variance is None:
+        outcome.warnings.append(
+            f"denoised plainly; variance: {info.variance}. --variance-of says what channels that are no "
+            "variance of the mean hold"
+        )
+    elif not (np.asarray(frame.variance) > 0).any():
+        if info.spp == 1:
+            outcome.warnings.append(
+                "denoised plainly, for the variance is zero: 1 sample per pixel has no spread"
+            )
+            return frame.replace(variance=None)
+        outcome.warnings.append(
+            "the variance is zero in every pixel, so the render counts as converged and stays as it is; "
+            "if that is for lack of samples, say --spp 1"
+        )
+    return frame
+
+
+def _reference(item: Item, frame: pd.Frame, outcome: Outcome) -> np.ndarray:
+    assert item.reference is not None
+    found, _ = read_exr_with_info(item.reference, auxiliary=False)
+    if found.size != frame.size:
+        (h, w), (height, width) = found.size, frame.size
+        raise Failure(
+            f"{item.reference}: the reference is {w}×{h} pixels (width × height) but {item.input} "
+            f"is {width}×{height}: they must show the same view."
+        )
+    color = np.asarray(found.color)
+    if not np.isfinite(color).all():
+        bad = int((~np.isfinite(color)).any(-1).sum())
+        outcome.warnings.append(f"the reference has {bad} pixels of NaN or infinity, filled in")
+        color = _repaired(found)
+    return color
+
+
+def _repaired(frame: pd.Frame) -> np.ndarray:
+    return np.asarray(jax.jit(pd.repair)(frame)[0].color)
+
+
+def _denoise(
+    frame: pd.Frame, denoiser: pd.Denoiser, estimate: EstimateOptions, outcome: Outcome
+) -> _Images:
+    if frame.variance is None:
+        outcome.mode = "plain"
+        denoised, repairs = pd.denoise(frame, denoiser)
+        image = np.asarray(denoised)
+        maps = {"denoised": image}
+    else:
+        method = estimate.build()
+        outcome.mode, outcome.method = "progressive", repr(method)
+        result = pd.progressive_denoise(
+            frame, denoiser, method=method, key=jax.random.key(estimate.seed)
+        )
+        repairs, image = result.repairs, np.asarray(result.image)
+        names = ("alpha", "denoised", "sure", "divergence")
+        maps = {name: np.asarray(getattr(result, name)) for name in names}
+        maps["variance"] = np.asarray(frame.variance)
+        outcome.mean_alpha = float(maps["alpha"].mean(dtype=np.float64))
+        outcome.mean_sure = float(maps["sure"].mean(dtype=np.float64))
+    maps["noisy"] = np.asarray(frame.color)
+    outcome.repairs = {name: int(n) for name, n in repairs._asdict().items()}
+    if not np.isfinite(image).all():
+        raise Failure(f"{outcome.input}: the result is not finite; nothing was written.")
+    return _Images(image, frame, maps)
+
+
+def _measure(images: _Images, reference: np.ndarray) -> Scores:
+    noisy = images.maps["noisy"]
+    if not np.isfinite(noisy).all():
+        noisy = _repaired(images.frame)
+    compared = {"noisy": noisy, "denoised": images.maps["denoised"]}
+    if images.frame.variance is not None:
+        compared["mixed"] = images.image
+    return compare(compared, reference)
+
+
+_LAYERS = {"variance": "noisy_variance"}
+"""Layers named otherwise than asked for: Variance would be read as that of the result."""
+
+
+def _write(
+    item: Item, images: _Images, info: ExrInfo, settings: Settings, outcome: Outcome
+) -> None:
+    layers, buffers, missing = {}, {}, []
+    for name in settings.save:
+        if name in ("albedo", "normal"):
+            buffers[name] = getattr(images.frame, name)
+            found = buffers[name] is not None
+        else:
+            found = name in images.maps
+            if found:
+                layers[_LAYERS.get(name, name)] = images.maps[name]
+        if not found:
+            missing.append(name)
+    if missing:
+        lack = "the file has none" if set(missing) <= set(SAVE_ALWAYS) else "there is no variance"
+        outcome.warnings.append(f"not saved: {', '.join(missing)}, for {lack}")
+    image = pd.Frame(images.image, None, **buffers) if buffers else images.image
+    outcome.notes += write_exr(
+        item.output,
+        image,
+        layers=layers,
+        like=info,
+        spp=info.spp,
+        overwrite=settings.force,
+        half=settings.half,
+    )

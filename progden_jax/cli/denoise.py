@@ -1,0 +1,176 @@
+"""`progden denoise`: files in, files out."""
+
+import contextlib
+import os
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from progden_jax.cli._options import (
+    SAVE,
+    EstimateOptions,
+    NetworkOptions,
+    ReadOptions,
+    parse_save,
+)
+from progden_jax.cli._paths import Item, plan
+from progden_jax.cli._run import FAILED, OK, UsageError, complain, explain, print_json, tables
+
+if TYPE_CHECKING:
+    from progden_jax.cli._job import Outcome
+
+HELP = """Denoise renders progressively: mix each with its denoised version so that it stays true.
+
+Outputs hold the result in R, G, B and keep the input's windows, attributes and alpha. A file without variance
+is denoised plainly. Nothing is replaced without --force.
+
+```
+progden denoise room.exr -o clean.exr
+progden denoise frames/ -o clean/ --quality high --save alpha,sure
+progden denoise room.exr -o clean.exr --variance-from roomA.exr roomB.exr
+```
+"""
+
+
+def denoise(
+    *inputs: Annotated[
+        Path, Parameter(name="IN", help="EXR files, or folders of them, subfolders included.")
+    ],
+    output: Annotated[
+        str,
+        Parameter(
+            name=["--output", "-o"],
+            help="A file for one input, else a folder, made if missing; a final slash means a folder.",
+        ),
+    ],
+    read: ReadOptions | None = None,
+    network: NetworkOptions | None = None,
+    estimate: EstimateOptions | None = None,
+    save: Annotated[
+        str | None,
+        Parameter(help=f"Further layers for the output, with commas: {', '.join(SAVE)}."),
+    ] = None,
+    half: Annotated[
+        bool, Parameter(help="Write half floats: half the size, about 3 digits.")
+    ] = False,
+    reference: Annotated[
+        Path | None,
+        Parameter(help="The true image, to print errors against; or a folder of such."),
+    ] = None,
+    force: Annotated[bool, Parameter(help="Replace outputs that exist.")] = False,
+    json: Annotated[
+        bool, Parameter(help="Print what was done as one JSON list, an object per file.")
+    ] = False,
+) -> int:
+    read, network = read or ReadOptions(), network or NetworkOptions()
+    estimate = estimate or EstimateOptions()
+    saved = parse_save(save)
+    for options in (read, network, estimate):
+        options.check()
+    if network.no_aux and {"albedo", "normal"} & set(saved):
+        raise UsageError("--no-aux leaves albedo and normal out, and --save asks for them.")
+    items = plan(
+        inputs,
+        Path(output),
+        folder=output.endswith(("/", os.sep)),
+        variance_from=read.variance_from or (),
+        reference=reference,
+        force=force,
+    )
+    from progden_jax import enable_compilation_cache
+    from progden_jax.cli._job import Settings, process
+
+    enable_compilation_cache()
+    settings = Settings(read, network, estimate, saved, half, force)
+    return _run_all(items, lambda item, outcome: process(item, settings, outcome), json=json)
+
+
+def _run_all(items: list[Item], process: Callable[[Item, "Outcome"], None], *, json: bool) -> int:
+    """Every file in turn, one that fails keeping no other; the exit status."""
+    from progden_jax.cli._job import Outcome
+
+    outcomes: list[Outcome] = []
+    try:
+        with _progress(len(items), enabled=len(items) > 1) as (advance, show):
+            for item in items:
+                advance(item.input.name)
+                outcome = Outcome(str(item.input), str(item.output))
+                outcomes.append(outcome)
+                try:
+                    process(item, outcome)
+                except Exception as error:
+                    outcome.error = explain(error)
+                    complain(_about(outcome.input, outcome.error))
+                for warning in outcome.warnings:
+                    complain(_about(outcome.input, f"warning: {warning}"))
+                if outcome.ok and not json:
+                    show(outcome.line())
+    except KeyboardInterrupt:
+        outcomes = [o for o in outcomes if o.ok or o.error]
+        complain(f"{sum(o.ok for o in outcomes)} of {len(items)} files were done")
+        if json:
+            print_json([asdict(o) for o in outcomes])
+        raise
+    failed = sum(not o.ok for o in outcomes)
+    if json:
+        print_json([asdict(o) for o in outcomes])
+    else:
+        _print_scores(outcomes)
+    if failed and len(items) > 1:
+        complain(f"{failed} of {len(items)} files failed")
+    return FAILED if failed else OK
+
+
+def _about(path: str, message: str) -> str:
+    """The message with its file in front, where it does not say so itself."""
+    return message if message.startswith(path) else f"{path}: {message}"
+
+
+@contextlib.contextmanager
+def _progress(
+    total: int, *, enabled: bool
+) -> Iterator[tuple[Callable[[str], None], Callable[[str], None]]]:
+    """A bar on stderr if that is a terminal: `advance` to the next file, `show` a line on stdout."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    console = Console(stderr=True)
+    columns = (
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[name]}", markup=False),
+    )
+    bar = Progress(
+        *columns,
+        console=console,
+        disable=not (enabled and console.is_terminal),
+        transient=True,
+        redirect_stdout=False,
+    )
+    task = bar.add_task("", total=total, name="", completed=-1)
+
+    def advance(name: str) -> None:
+        bar.update(task, advance=1, name=name)
+
+    def show(line: str) -> None:
+        # On one terminal the bar has to make room; a redirected stdout must get its own lines.
+        if bar.disable or not sys.stdout.isatty():
+            print(line, flush=True)
+        else:
+            console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+    with bar:
+        yield advance, show
+
+
+def _print_scores(outcomes: "list[Outcome]") -> None:
+    rows = {o.input: o.metrics for o in outcomes if o.metrics}
+    if rows:
+        from progden_jax.cli._compare import score_table
+
+        tables().print(score_table(rows, of="file"))
