@@ -11,9 +11,11 @@ from progden_jax.compilation import enable_compilation_cache
 from progden_jax.denoisers import Denoiser, FunctionDenoiser
 from progden_jax.divergence import (
     DivergenceEstimate,
+    Exact,
     FiniteDifference,
     Method,
     MonteCarlo,
+    Probing,
     divergence,
     divergence_and_error,
 )
@@ -29,6 +31,7 @@ __all__ = [
     "Denoised",
     "Denoiser",
     "DivergenceEstimate",
+    "Exact",
     "ExrError",
     "FiniteDifference",
     "Frame",
@@ -37,6 +40,7 @@ __all__ = [
     "Mixer",
     "MixingNet",
     "MonteCarlo",
+    "Probing",
     "Repairs",
     "Result",
     "closed_form_alpha",

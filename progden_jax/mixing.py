@@ -137,9 +137,11 @@ def closed_form_alpha(
         spread = _windows.box_sum(jnp.minimum(excess**2, 4 * squared * largest), window)
         bias = bias - confidence * safe_sqrt(spread)
     usable = (total > 0) & (noise > 0)
-    # Clipping before dividing keeps a tiny denominator from overflowing, in the gradient too.
-    share = jnp.clip(bias, 0, total) / jnp.where(usable, total, 1)
-    return jnp.where(usable, 1 - share, 0)
+    # Selecting before dividing keeps a tiny denominator from overflowing, in the gradient too. (Written as
+    # clip(bias, 0, total) / total, LLVM with AVX-512 compiles a wrong derivative; a test pins this one.)
+    mixed = usable & (bias > 0) & (bias < total)
+    share = jnp.where(mixed, bias, 0) / jnp.where(mixed, total, 1)
+    return jnp.where(usable & (bias < total), 1 - share, 0)
 
 
 class Mixer(Protocol):

@@ -116,7 +116,7 @@ def _progressive(
 ) -> Result:
     frame, inside, repairs = _prepare(frame, valid)
     x, variance = frame.color, cast(Array, frame.variance)
-    y, divergence, _ = method.evaluate(_bind(denoiser, frame, valid), x, variance, key)
+    y, divergence, *_ = method.evaluate(_bind(denoiser, frame, valid), x, variance, key)
     risk = sure(x, y, variance, divergence)
     alpha = mixer(x, y, variance, divergence, risk, inside=inside)
     alpha = t_bound(alpha, x, y, variance, inside=inside)

@@ -15,6 +15,8 @@ METHODS = {
     "differences": pd.FiniteDifference(probes=8, epsilon=1e-2),
     "rademacher": pd.MonteCarlo(probes=8),
     "gaussian": pd.MonteCarlo(probes=8, distribution="gaussian"),
+    "probing": pd.Probing(probes=8, replicates=4),
+    "adaptive": pd.Probing(probes=8, replicates=4, tolerance=1e-6, tile=4),
 }
 SWEEP = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS.keys())
 

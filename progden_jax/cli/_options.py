@@ -35,6 +35,8 @@ METHODS = {
     "monte-carlo": MethodChoice("MonteCarlo"),
     "monte-carlo-gaussian": MethodChoice("MonteCarlo", {"distribution": "gaussian"}),
     "finite-difference": MethodChoice("FiniteDifference"),
+    "probing": MethodChoice("Probing"),
+    "exact": MethodChoice("Exact", takes_probes=False),
 }
 
 SAVE = ("alpha", "sure", "denoised", "divergence", "noisy", "variance", "albedo", "normal")
@@ -244,7 +246,10 @@ class EstimateOptions:
         settings = dict(choice.settings)
         if self.probes is not None:
             settings["probes"] = self.probes
-        return getattr(pd, choice.type)(**settings)
+        try:
+            return getattr(pd, choice.type)(**settings)
+        except ValueError as error:
+            raise UsageError(f"--method {self.method}: {error}") from error
 
 
 def parse_save(text: str | None) -> tuple[str, ...]:

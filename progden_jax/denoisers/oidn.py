@@ -5,6 +5,7 @@ at 0, perceptually uniform (PU) transfer; albedo clamped to [0, 1]; normals clam
 [0, 1]; zeros up to a multiple of 16; the U-Net; and the inverse of the colour's steps.
 """
 
+import dataclasses
 import functools
 import importlib.util
 from collections.abc import Callable
@@ -20,6 +21,7 @@ from jaxtyping import Array, Float
 from progden_jax import _checks, transfer
 from progden_jax.denoisers import unet
 from progden_jax.denoisers._base import Bound
+from progden_jax.denoisers.graph import Layered, Node
 from progden_jax.denoisers.tza import parse_tza
 from progden_jax.frame import Frame
 
@@ -109,7 +111,7 @@ class OIDN:
         if exposure is None:
             exposure = autoexposure(frame.color, valid=valid)
         exposure = lax.stop_gradient(jnp.asarray(exposure, frame.color.dtype))
-        return jax.tree_util.Partial(_denoise, self, tuple(auxiliary), exposure, valid)
+        return BoundOIDN(self, tuple(auxiliary), exposure, valid)
 
     @property
     def receptive_radius(self) -> int:
@@ -140,28 +142,88 @@ def _jitted_call(denoiser: OIDN, frame: Frame) -> Array:
     return denoiser.bind(frame)(frame.color)
 
 
-def _denoise(
-    denoiser: OIDN,
-    auxiliary: tuple[Array, ...],
-    exposure: Array,
-    valid: tuple[Array | int, Array | int] | None,
-    color: Float[Array, "h w 3"],
-) -> Float[Array, "h w 3"]:
-    _checks.image("x", color)
-    inside = None
-    if valid is not None:
-        rows = jnp.arange(color.shape[0]) < valid[0]
-        columns = jnp.arange(color.shape[1]) < valid[1]
-        inside = (rows[:, None] & columns[None, :])[..., None]
-    radiance = color * exposure
-    # At exactly 0 the derivative is the one from the right: black pixels respond to light.
-    radiance = jnp.where((radiance < 0) | jnp.isnan(radiance), 0, radiance)
-    x = transfer.pu_hdr(radiance)
-    y = run_unet(
-        denoiser.params, (x, *auxiliary), inside=inside, valid=valid, precision=denoiser.precision
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class BoundOIDN:
+    """y = f(x) for one frame: what `OIDN.bind` gives."""
+
+    denoiser: OIDN
+    auxiliary: tuple[Array, ...]
+    exposure: Array
+    valid: tuple[Array | int, Array | int] | None
+
+    def __call__(self, x: Float[Array, "h w 3"]) -> Float[Array, "h w 3"]:
+        """The denoised image, (H, W, 3) linear radiance."""
+        _checks.image("x", x)
+        inside = _inside(x.shape[:2], self.valid)
+        y = run_unet(
+            self.denoiser.params,
+            (self._encode(x), *self.auxiliary),
+            inside=inside,
+            valid=self.valid,
+            precision=self.denoiser.precision,
+        )
+        y = self._decode(y)
+        return y if inside is None else jnp.where(inside, y, 0)
+
+    @property
+    def receptive_radius(self) -> int:
+        """How many pixels away an output pixel can depend on the input."""
+        return self.denoiser.receptive_radius
+
+    @property
+    def alignment(self) -> int:
+        """Pixels after which the way that outputs depend on inputs repeats."""
+        return unet.ALIGNMENT
+
+    @property
+    def layers(self) -> tuple[tuple[Node, ...], unet.Params]:
+        """The network's graph and parameters."""
+        return unet.graph(self.denoiser.params), self.denoiser.params
+
+    def layered(self, x: Float[Array, "h w 3"]) -> Layered:
+        """f taken apart at x, for algorithms that look inside the network."""
+        encoded, slope = jax.jvp(self._encode, (x,), (jnp.ones_like(x),))
+        inputs = jnp.concatenate((encoded, *self.auxiliary), axis=-1)
+        inside = _inside(x.shape[:2], self.valid)
+        if inside is not None:
+            inputs, slope = jnp.where(inside, inputs, 0), jnp.where(inside, slope, 0)
+        inputs = _pad_to_alignment(inputs)
+        aligned = _inside(inputs.shape[:2], _aligned(self.valid))
+        params = self.denoiser.params
+        return Layered(unet.graph(params), params, inputs, aligned, slope, self._decode)
+
+    def _encode(self, x: Array) -> Array:
+        radiance = x * self.exposure
+        # At exactly 0 the derivative is the one from the right: black pixels respond to light.
+        radiance = jnp.where((radiance < 0) | jnp.isnan(radiance), 0, radiance)
+        return transfer.pu_hdr(radiance)
+
+    def _decode(self, y: Array) -> Array:
+        return transfer.pu_hdr_inverse(y) / self.exposure
+
+
+Valid = tuple[Array | int, Array | int] | None
+
+
+def _inside(shape: tuple[int, ...], valid: Valid) -> Array | None:
+    if valid is None:
+        return None
+    rows, columns = (jnp.arange(n) < v for n, v in zip(shape, valid, strict=True))
+    return (rows[:, None] & columns[None, :])[..., None]
+
+
+def _aligned(valid: Valid) -> Valid:
+    if valid is None:
+        return None
+    size = unet.ALIGNMENT
+    return (valid[0] + size - 1) // size * size, (valid[1] + size - 1) // size * size
+
+
+def _pad_to_alignment(x: Array) -> Array:
+    return jnp.pad(
+        x, ((0, -x.shape[0] % unet.ALIGNMENT), (0, -x.shape[1] % unet.ALIGNMENT), (0, 0))
     )
-    y = transfer.pu_hdr_inverse(y) / exposure
-    return y if inside is None else jnp.where(inside, y, 0)
 
 
 def run_unet(
@@ -176,20 +238,13 @@ def run_unet(
     x = jnp.concatenate(channels, axis=-1)
     if inside is not None:
         x = jnp.where(inside, x, 0)
-    height, width = x.shape[:2]
-    x = jnp.pad(x, ((0, -height % unet.ALIGNMENT), (0, -width % unet.ALIGNMENT), (0, 0)))
-    aligned = None if valid is None else tuple(_align(n) for n in valid)
     y = unet.apply(
         params,
-        x,
-        valid=cast(Any, aligned),
+        _pad_to_alignment(x),
+        valid=_aligned(valid),
         precision=lax.Precision.HIGHEST if precision == "highest" else cast(Any, precision),
     )
-    return y[:height, :width]
-
-
-def _align(n: Array | int) -> Array | int:
-    return (n + unet.ALIGNMENT - 1) // unet.ALIGNMENT * unet.ALIGNMENT
+    return y[: x.shape[0], : x.shape[1]]
 
 
 def autoexposure(

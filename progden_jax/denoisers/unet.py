@@ -14,6 +14,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from progden_jax.denoisers.graph import Conv, Input, MaxPool, Node, Relu, Upsample
+
 Params = Mapping[str, Mapping[str, Any]]
 """Layer name -> {"kernel": (3, 3, in, out), "bias": (out,)}."""
 
@@ -116,6 +118,31 @@ def apply(
         for name in names:
             x = convolve(name, x, level)
     return x
+
+
+def graph(params: Params) -> tuple[Node, ...]:
+    """The network as a list of layers, for the exact divergence by cones."""
+    encoder, bottom, decoder = layout(params)
+    nodes: list[Node] = [Input()]
+
+    def convolve(names: Sequence[str], *sources: int) -> int:
+        for name in names:
+            nodes.append(Conv(sources, name))
+            nodes.append(Relu(len(nodes) - 1))
+            sources = (len(nodes) - 1,)
+        return sources[0]
+
+    x, skips = 0, [0]
+    for names in encoder:
+        nodes.append(MaxPool(convolve(names, x)))
+        x = len(nodes) - 1
+        skips.append(x)
+    skips.pop()
+    x = convolve(bottom, x)
+    for skip, names in zip(reversed(skips), decoder, strict=True):
+        nodes.append(Upsample(x))
+        x = convolve(names, len(nodes) - 1, skip)
+    return tuple(nodes)
 
 
 def max_pool(x: Float[Array, "h w c"]) -> Float[Array, "h2 w2 c"]:

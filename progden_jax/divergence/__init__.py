@@ -11,15 +11,19 @@ from jaxtyping import Array, Float
 
 from progden_jax import _checks
 from progden_jax.divergence._base import Evaluation, Function, Method
+from progden_jax.divergence.exact import Exact
 from progden_jax.divergence.monte_carlo import FiniteDifference, MonteCarlo
+from progden_jax.divergence.probing import Probing
 
 __all__ = [
     "DivergenceEstimate",
     "Evaluation",
+    "Exact",
     "FiniteDifference",
     "Function",
     "Method",
     "MonteCarlo",
+    "Probing",
     "divergence",
     "divergence_and_error",
     "evaluate",

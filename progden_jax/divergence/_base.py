@@ -5,7 +5,7 @@ from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from progden_jax._numeric import safe_sqrt
 
@@ -16,12 +16,14 @@ Function = Callable[[Float[Array, "h w 3"]], Float[Array, "h w 3"]]
 class Evaluation(NamedTuple):
     """y = f(x), the estimate of σ²·∂f/∂x and the estimate's standard error, (H, W, 3) each.
 
-    The standard error is 0 where the estimate is exact and inf where one probe cannot tell.
+    The standard error is 0 where the estimate is exact and inf where one probe cannot tell. `probes` is
+    how many were spent on each tile, from methods that decide it on the way.
     """
 
     value: Float[Array, "h w 3"]
     divergence: Float[Array, "h w 3"]
     standard_error: Float[Array, "h w 3"]
+    probes: Int[Array, "rows columns"] | None = None
 
 
 class Method(Protocol):

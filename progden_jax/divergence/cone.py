@@ -1,0 +1,508 @@
+"""The exact diagonal of a network's Jacobian from windows of a few pixels.
+
+For ∂f_p/∂x_p only what lies both in the forward cone of input pixel p and in the backward cone of output
+pixel p matters: at every layer a window of a few pixels around p. A primal pass keeps which ReLUs pass
+and which of four values won each pooling; then the unit tangents of the three channels at p go
+through the windows alone. Pixels of equal phase (position modulo the largest stride) see equal
+windows and form one batch; offsets that differ between phases are traced, so one program serves all.
+"""
+
+import dataclasses
+import functools
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from progden_jax.denoisers import graph as g
+
+
+@dataclasses.dataclass(frozen=True)
+class Window:
+    """Where along one axis a node's window begins, per phase, in the node's own pixels and relative
+    to the one above p, and how many pixels it spans (the most over phases)."""
+
+    origin: np.ndarray
+    size: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """The windows of a graph: what `jacobian_diagonal` runs and what its cost follows from."""
+
+    nodes: tuple[g.Node, ...]
+    levels: tuple[int, ...]
+    windows: tuple[Window | None, ...]
+    """None where no path from p to p leads through a node."""
+
+    @property
+    def period(self) -> int:
+        """Pixels after which the windows repeat."""
+        return 1 << max(self.levels)
+
+
+def plan(nodes: Sequence[g.Node], params: Any) -> Plan:
+    """The windows of every node: forward cone of one input pixel, met with its backward cone.
+
+    Both are intervals per axis and phase. Convolutions widen them, pooling and upsampling halve
+    and double the positions, rounding as the phase has it.
+    """
+    levels = g.levels(nodes)
+    phases = np.arange(1 << max(levels))
+    # Absolute positions, for a pixel p equal to its phase plus a multiple of every stride.
+    forward: list[np.ndarray | None] = []
+    for node in nodes:
+        spans = [forward[s] for s in g.sources(node)]
+        match node:
+            case g.Input():
+                span = np.stack([phases, phases])
+            case g.Conv():
+                r = _radius(params, node)
+                span = _union([s if s is None else s + np.array([[-r], [r]]) for s in spans])
+            case g.MaxPool():
+                span = None if spans[0] is None else spans[0] >> 1
+            case g.Upsample():
+                span = None if spans[0] is None else 2 * spans[0] + np.array([[0], [1]])
+            case _:
+                span = _union(spans)
+        forward.append(span)
+
+    backward: list[np.ndarray | None] = [None] * len(nodes)
+    backward[-1] = np.stack([phases, phases])
+    for index in reversed(range(len(nodes))):
+        span, node = backward[index], nodes[index]
+        if span is None:
+            continue
+        match node:
+            case g.Conv():
+                r = _radius(params, node)
+                needed = span + np.array([[-r], [r]])
+            case g.MaxPool():
+                needed = 2 * span + np.array([[0], [1]])
+            case g.Upsample():
+                needed = span >> 1
+            case _:
+                needed = span
+        for source in g.sources(node):
+            backward[source] = _union([backward[source], needed])
+
+    windows: list[Window | None] = []
+    for level, ahead, behind in zip(levels, forward, backward, strict=True):
+        if ahead is None or behind is None:
+            windows.append(None)
+            continue
+        low, high = np.maximum(ahead[0], behind[0]), np.minimum(ahead[1], behind[1])
+        size = int((high - low).max()) + 1
+        low, high = low - (phases >> level), high - (phases >> level)
+        # Where smaller windows leave room, one origin for all phases makes offsets static.
+        if (high - size + 1).max() <= low.min():
+            low = np.full_like(low, low.min())
+        windows.append(Window(low, size) if size > 0 else None)
+    return Plan(tuple(nodes), tuple(levels), tuple(windows))
+
+
+def _radius(params: Any, node: g.Conv) -> int:
+    return params[node.layer]["kernel"].shape[0] // 2
+
+
+def _union(spans: Sequence[np.ndarray | None]) -> np.ndarray | None:
+    known = [span for span in spans if span is not None]
+    if not known:
+        return None
+    return np.stack([np.min([s[0] for s in known], 0), np.max([s[1] for s in known], 0)])
+
+
+def multiply_adds(plan: Plan, params: Any) -> float:
+    """Multiply-adds of the tangent pass per pixel, all three channels: what `auto` compares."""
+    total = 0.0
+    for index, node in enumerate(plan.nodes):
+        window = plan.windows[index]
+        if not isinstance(node, g.Conv) or window is None:
+            continue
+        kernel = params[node.layer]["kernel"]
+        for source, part in zip(node.sources, _split(plan, params, node), strict=True):
+            origin = plan.windows[source]
+            if origin is None:
+                continue
+            if isinstance(plan.nodes[source], g.Upsample):
+                taps = (window.size * (kernel.shape[0] + 1) // 2) ** 2
+            else:
+                taps = sum(_overlap(origin, window, tap)[2] for tap in _taps(kernel.shape[0])) ** 2
+            total += (
+                3 * taps * part.stop * kernel.shape[3] - 3 * taps * part.start * kernel.shape[3]
+            )
+    return total
+
+
+def _split(plan: Plan, params: Any, node: g.Conv) -> list[slice]:
+    """The input channels of a convolution that belong to each of its sources."""
+    widths = [_channels(plan.nodes, params, source) for source in node.sources]
+    known = sum(w for w in widths if w is not None)
+    total = params[node.layer]["kernel"].shape[2]
+    starts = np.cumsum([0, *(total - known if w is None else w for w in widths)])
+    return [slice(int(a), int(b)) for a, b in itertools.pairwise(starts)]
+
+
+def _channels(nodes: Sequence[g.Node], params: Any, index: int) -> int | None:
+    """The channels of a node; None for the input, which the convolutions' weights tell."""
+    node = nodes[index]
+    match node:
+        case g.Input():
+            return None
+        case g.Conv():
+            return params[node.layer]["kernel"].shape[3]
+        case _:
+            return _channels(nodes, params, g.sources(node)[0])
+
+
+def _taps(size: int) -> range:
+    return range(-(size // 2), size // 2 + 1)
+
+
+def _overlap(source: Window, target: Window, tap: int) -> tuple[int, int, int]:
+    """Start in target and source, and length, of where target pixel o reads source pixel o + tap.
+
+    For windows whose offset is the same in every phase.
+    """
+    shift = int(target.origin[0] - source.origin[0]) + tap
+    start = max(0, -shift)
+    length = min(target.size, source.size - shift) - start
+    return start, start + shift, max(length, 0)
+
+
+class Sweep:
+    """The tangents of one batch of cells: pixels of one phase, three unit directions each."""
+
+    def __init__(
+        self,
+        plan: Plan,
+        params: Any,
+        kept: dict[int, Array],
+        phase: tuple[Array, Array],
+        cells: tuple[Array, Array],
+        precision: Any,
+    ) -> None:
+        self.plan, self.params, self.kept = plan, params, kept
+        self.phase, self.cells, self.precision = phase, cells, precision
+
+    def run(self) -> Float[Array, "cells 3 3"]:
+        """∂output_c/∂input_d of each cell's pixel, (cells, d, c)."""
+        plan = self.plan
+        values: dict[int, Array] = {}
+        for index, node in enumerate(plan.nodes):
+            window = plan.windows[index]
+            if window is None:
+                continue
+            match node:
+                case g.Input():
+                    number = self.cells[0].shape[0]
+                    unit = jnp.eye(3, self._input_channels(), dtype=self._dtype())
+                    value = jnp.broadcast_to(
+                        unit[None, :, None, None], (number, 3, 1, 1, unit.shape[1])
+                    )
+                    value = value.reshape(3 * number, 1, 1, -1)
+                case g.Conv():
+                    value = self._convolve(node, window, values)
+                    if index in self.kept:
+                        value = self._scale(
+                            value, self._around(self.kept[index], index, window, False)
+                        )
+                case g.Relu():
+                    value = self._scale(
+                        values[node.source], self._around(self.kept[index], index, window, False)
+                    )
+                case g.MaxPool():
+                    value = self._pool(index, node, window, values[node.source])
+                case g.Upsample():
+                    value = values[node.source]  # Read by convolutions, which repeat it themselves.
+                case g.Add():
+                    parts = [
+                        self._move(values[s], self._window(s), window)
+                        for s in node.sources
+                        if s in values
+                    ]
+                    value = parts[0] if len(parts) == 1 else parts[0] + parts[1]
+            values[index] = value
+        last = values[len(plan.nodes) - 1]
+        return last.reshape(-1, 3, last.shape[-1])
+
+    def _dtype(self) -> Any:
+        return jax.tree.leaves(self.params)[0].dtype
+
+    def _input_channels(self) -> int:
+        """As many as the first convolution of the input takes."""
+        for node in self.plan.nodes:
+            if isinstance(node, g.Conv) and node.sources == (0,):
+                return self.params[node.layer]["kernel"].shape[2]
+        raise ValueError("no convolution of the graph reads the input alone.")
+
+    def _window(self, index: int) -> Window:
+        window = self.plan.windows[index]
+        assert window is not None
+        return window
+
+    def _convolve(self, node: g.Conv, window: Window, values: dict[int, Array]) -> Array:
+        kernel = self.params[node.layer]["kernel"]
+        total = None
+        for source, part in zip(node.sources, _split(self.plan, self.params, node), strict=True):
+            if source not in values:
+                continue
+            weights = kernel[:, :, part]
+            if isinstance(self.plan.nodes[source], g.Upsample):
+                below = self.plan.nodes[source]
+                assert isinstance(below, g.Upsample)
+                added = self._convolve_upsampled(
+                    values[source],
+                    self._window(below.source),
+                    self.plan.levels[source],
+                    weights,
+                    window,
+                )
+            else:
+                added = self._convolve_window(values[source], self._window(source), weights, window)
+            total = added if total is None else total + added
+        assert total is not None
+        return total
+
+    def _convolve_window(self, x: Array, source: Window, weights: Array, target: Window) -> Array:
+        """Products of every tap with the pixels where source and target windows overlap."""
+        shifts = target.origin - source.origin
+        if (shifts != shifts[0]).any():
+            r = weights.shape[0] // 2
+            wide = Window(target.origin - r, target.size + 2 * r)
+            x, source = self._move(x, source, wide), wide
+        total = None
+        for i, tap_i in enumerate(_taps(weights.shape[0])):
+            to_row, row, rows = _overlap(source, target, tap_i)
+            for j, tap_j in enumerate(_taps(weights.shape[1])):
+                to_column, column, columns = _overlap(source, target, tap_j)
+                if not rows or not columns:
+                    continue
+                part = x[:, row : row + rows, column : column + columns]
+                part = self._product(part, weights[i, j])
+                if (rows, columns) != (target.size, target.size):
+                    part = jnp.pad(
+                        part,
+                        (
+                            (0, 0),
+                            (to_row, target.size - to_row - rows),
+                            (to_column, target.size - to_column - columns),
+                            (0, 0),
+                        ),
+                    )
+                total = part if total is None else total + part
+        assert total is not None
+        return total
+
+    def _product(self, x: Array, weights: Array) -> Array:
+        flat = jnp.matmul(x.reshape(-1, x.shape[-1]), weights, precision=self.precision)
+        return flat.reshape(*x.shape[:-1], weights.shape[-1])
+
+    def _convolve_upsampled(
+        self, x: Array, source: Window, level: int, weights: Array, target: Window
+    ) -> Array:
+        """3×3 after nearest upsampling, as 2×2 on what was upsampled: 4 products for 9.
+
+        Of an upsampled position v, odd ones see their parent with weights 0 + 1 and the next with 2; even
+        ones the parent before with 0 and their own with 1 + 2. Which target positions are odd
+        depends on the phase, so weights and starts are chosen by it.
+        """
+        folded = []
+        for even in (False, True):
+            rows = (
+                (weights[0], weights[1] + weights[2])
+                if even
+                else (weights[0] + weights[1], weights[2])
+            )
+            folded.append(
+                [
+                    [
+                        (row[0], row[1] + row[2]) if e else (row[0] + row[1], row[2])
+                        for e in (False, True)
+                    ]
+                    for row in rows
+                ]
+            )
+        # (row parity, column parity, tap row, tap column, in, out)
+        kernels = jnp.stack(
+            [
+                jnp.stack(
+                    [jnp.stack([jnp.stack(folded[er][tr][ec]) for tr in (0, 1)]) for ec in (0, 1)]
+                )
+                for er in (0, 1)
+            ]
+        )
+        grid = np.arange(len(target.origin))
+        # Absolute upsampled positions of the targets, and the parents they begin at.
+        first = (grid >> level) + target.origin
+        parent_origin = (grid >> (level + 1)) + source.origin
+        blocks = []
+        for row_class in (0, 1):
+            row_count = (target.size - row_class + 1) // 2
+            rows, row_even = self._parents(
+                first + row_class, parent_origin, source.size, row_count, 0
+            )
+            line = []
+            for column_class in (0, 1):
+                count = (target.size - column_class + 1) // 2
+                columns, even = self._parents(
+                    first + column_class, parent_origin, source.size, count, 1
+                )
+                taken = self._take(x, rows, columns, row_count + 1, count + 1, source.size)
+                kernel = kernels[row_even, even]
+                line.append(
+                    sum(
+                        self._product(taken[:, i : i + row_count, j : j + count], kernel[i, j])
+                        for i in (0, 1)
+                        for j in (0, 1)
+                    )
+                )
+            blocks.append(_interleave(line[0], line[1], 2, target.size))
+        return _interleave(blocks[0], blocks[1], 1, target.size)
+
+    def _parents(
+        self, positions: np.ndarray, origin: np.ndarray, size: int, count: int, axis: int
+    ) -> tuple[Array, Array]:
+        """Where in the parents' window the pairs of every second position begin, and its parity."""
+        starts = ((positions - 1) >> 1) - origin
+        phase = self.phase[axis]
+        return jnp.asarray(starts)[phase], jnp.asarray(1 - (positions & 1))[phase]
+
+    def _take(
+        self, x: Array, row: Array, column: Array, rows: int, columns: int, size: int
+    ) -> Array:
+        """A part of a window that may begin before it or end after it, where it is zero."""
+        pad = max(rows, columns)
+        x = jnp.pad(x, ((0, 0), (pad, pad), (pad, pad), (0, 0)))
+        return lax.dynamic_slice(
+            x, (0, row + pad, column + pad, 0), (x.shape[0], rows, columns, x.shape[3])
+        )
+
+    def _move(self, x: Array, source: Window, target: Window) -> Array:
+        """A window cut out of another, zero where they do not overlap."""
+        for axis in (0, 1):
+            shift = target.origin - source.origin
+            low = max(0, -int(shift.min()))
+            high = max(0, int(shift.max()) + target.size - source.size)
+            widths = [(0, 0)] * x.ndim
+            widths[axis + 1] = (low, high)
+            x = jnp.pad(x, widths)
+            start = jnp.asarray(shift + low)[self.phase[axis]]
+            if (shift == shift[0]).all():
+                x = lax.slice_in_dim(
+                    x, int(shift[0]) + low, int(shift[0]) + low + target.size, axis=axis + 1
+                )
+            else:
+                x = lax.dynamic_slice_in_dim(x, start, target.size, axis + 1)
+        return x
+
+    def _pool(self, index: int, node: g.MaxPool, window: Window, x: Array) -> Array:
+        """Each pooled tangent is that of the value that won."""
+        level = self.plan.levels[index]
+        grid = np.arange(len(window.origin))
+        start = 2 * ((grid >> level) + window.origin) - (grid >> (level - 1))
+        x = self._move(x, self._window(node.source), Window(start, 2 * window.size))
+        batch, _, _, channels = x.shape
+        s = window.size
+        cells = x.reshape(batch, s, 2, s, 2, channels)
+        codes = self._around(self.kept[index], index, window, 4)
+        total = None
+        for code in range(4):
+            part = self._scale(cells[:, :, code // 2, :, code % 2], codes == code)
+            total = part if total is None else total + part
+        assert total is not None
+        return total
+
+    def _around(self, kept: Array, index: int, window: Window, outside: int | bool) -> Array:
+        """What the primal pass kept, in every cell's window: (cells, s, s, C)."""
+        level, s = self.plan.levels[index], window.size
+        reach = 2 * s + int(np.abs(window.origin).max())
+        padded = jnp.pad(kept, ((reach, reach), (reach, reach), (0, 0)), constant_values=outside)
+        step = self.plan.period >> level
+        corner = [
+            (phase >> level) + jnp.asarray(window.origin)[phase] + reach + step * cell
+            for phase, cell in zip(self.phase, self.cells, strict=True)
+        ]
+        cut = functools.partial(lax.dynamic_slice, slice_sizes=(s, s, kept.shape[-1]))
+        return jax.vmap(lambda row, column: cut(padded, (row, column, 0)))(*corner)
+
+    def _scale(self, x: Array, passes: Array) -> Array:
+        cells = passes.shape[0]
+        split = x.reshape(cells, -1, *x.shape[1:])
+        return jnp.where(passes[:, None], split, 0).reshape(x.shape)
+
+
+def _interleave(first: Any, second: Any, axis: int, size: int) -> Array:
+    """first[0], second[0], first[1], ...: `size` of them."""
+    if first.shape[axis] > second.shape[axis]:
+        widths = [(0, 0)] * second.ndim
+        widths[axis] = (0, 1)
+        second = jnp.pad(second, widths)
+    stacked = jnp.stack([first, second], axis=axis + 1)
+    shape = list(first.shape)
+    shape[axis] *= 2
+    return lax.slice_in_dim(stacked.reshape(shape), 0, size, axis=axis)
+
+
+def jacobian_diagonal(
+    plan: Plan,
+    params: Any,
+    kept: dict[int, Array],
+    size: tuple[int, int],
+    *,
+    chunk: int,
+    precision: Any,
+) -> Float[Array, "h w 3"]:
+    """∂output_pc/∂input_pc of a network at every pixel and channel, (H, W, 3), over all phases."""
+    period = plan.period
+    rows = lax.map(
+        lambda index: phase_diagonal(
+            plan, params, kept, size, index, chunk=chunk, precision=precision
+        ),
+        jnp.arange(period * period),
+    )
+    return assemble(rows, size, period)
+
+
+def assemble(rows: Array, size: tuple[int, int], period: int) -> Float[Array, "h w 3"]:
+    """The image from its phases, (period², H/period, W/period, 3)."""
+    height, width = size
+    split = rows.reshape(period, period, height // period, width // period, 3)
+    return split.transpose(2, 0, 3, 1, 4).reshape(height, width, 3)
+
+
+def phase_diagonal(
+    plan: Plan,
+    params: Any,
+    kept: dict[int, Array],
+    size: tuple[int, int],
+    index: Array,
+    *,
+    chunk: int,
+    precision: Any,
+) -> Float[Array, "h w 3"]:
+    """The diagonal at the pixels of one phase, (H/period, W/period, 3), `chunk` of them at once."""
+    period = plan.period
+    across = size[1] // period
+    count = (size[0] // period) * across
+    chunk = min(chunk, count)
+    phase = (index // period, index % period)
+
+    def some(first: Array) -> Array:
+        # The last chunk reaches back over cells already done instead of past the end.
+        cells = jnp.minimum(first, count - chunk) + jnp.arange(chunk)
+        sweep = Sweep(plan, params, kept, phase, (cells // across, cells % across), precision)
+        return jnp.diagonal(sweep.run(), axis1=1, axis2=2)
+
+    starts = jnp.arange(0, count, chunk)
+    found = lax.map(some, starts)
+    whole = count // chunk * chunk
+    flat = found[: count // chunk].reshape(whole, 3)
+    if whole < count:
+        flat = jnp.concatenate([flat, found[-1][chunk - (count - whole) :]])
+    return flat.reshape(size[0] // period, across, 3)

@@ -1,0 +1,174 @@
+"""Structured probes: sign patterns under which neighbouring pixels cancel instead of averaging out."""
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from progden_jax import _checks
+from progden_jax._numeric import safe_sqrt
+from progden_jax.divergence import _adaptive, _random
+from progden_jax.divergence._base import Evaluation, Function, accumulate
+
+MOST_PROBES = 1024
+"""Number of colours of the lattice, and so of probes before the pattern repeats."""
+
+_ROW_STEP = 539
+_CHANNEL_STEPS = (0, 775, 526)
+
+SCALES = ("radiance", "sigma", "unit")
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class Probing:
+    """Hierarchical probing on a lattice: mean of (σ²/w²) · b · J b, b = w·s·h_k.
+
+    s is one field of random signs, so the estimate is unbiased for any K. h_k are the first K Walsh
+    functions of each pixel's colour, x + 539 y + (0, 775, 526)_c mod 1024. After K = 2^n of them what is
+    left is the J_ij between pixels whose colours agree modulo K, and these lie far apart: the error falls
+    nearly as 1/K where J is local, not as 1/√K. The sequence is nested: more probes refine what fewer found.
+
+    The variance per pixel is (σ_i²/w_i)² Σ_{j≠i} (J_ij w_j c_ij)², c_ij the mean of h_k(i) h_k(j). Cost:
+    one denoiser pass and one tangent pass per probe.
+
+    Parameters
+    ----------
+    probes : number K of tangent passes, 1 to 1024, best a power of two; by default 16, or with a tolerance
+        1024, of which no more are spent than needed.
+    tolerance : stop, in each tile, once the standard error of the mean of SURE over the tile is at most
+        this share of that mean; None spends all probes. Checked after 1, 2, 4, ... probes per replicate. A
+        tile whose mean SURE is near 0 spends all. The denoiser runs on the whole frame until the last
+        tile has stopped. Under ``vmap`` all probes are computed, though the result is the same.
+    replicates : independent fields of signs that the probes are shared between. With one, the
+        default, the error is least and its size unknown (standard error inf); with R ≥ 2 the error is
+        larger (by about √R) and its size known from their spread. A tolerance needs at least 2, its default.
+    scale : "radiance" takes w = σ (σ + |f(x)|)^¾: a denoiser that works on the logarithm of radiance responds
+        less to a pixel the brighter it is, so dark ones would pollute bright ones. "sigma" takes w = σ,
+        better for filters linear in radiance; "unit" takes w = 1.
+    tile : edge of a tile in pixels.
+    chunk : probes in flight at once; memory grows with it.
+
+    Raises
+    ------
+    ValueError
+        If a setting is out of range, or probes is no multiple of replicates.
+
+    Notes
+    -----
+    Stathopoulos, Laeuchli, Orginos 2013. Lattice and exponent were fitted on training renders with OIDN's
+    network: experiments/divergence.
+    """
+
+    probes: int | None = None
+    tolerance: float | None = None
+    replicates: int | None = None
+    scale: str = "radiance"
+    tile: int = 32
+    chunk: int = 1
+
+    def __post_init__(self) -> None:
+        adaptive = self.tolerance is not None
+        if self.probes is None:
+            object.__setattr__(self, "probes", MOST_PROBES if adaptive else 16)
+        if self.replicates is None:
+            object.__setattr__(self, "replicates", 2 if adaptive else 1)
+        _checks.positive_int("probes", self.probes, at_most=MOST_PROBES)
+        _checks.positive_int("replicates", self.replicates)
+        _checks.positive_int("tile", self.tile)
+        _checks.positive_int("chunk", self.chunk)
+        _checks.choice("scale", self.scale, SCALES)
+        probes, replicates = self._counts
+        if probes % replicates:
+            raise ValueError(
+                f"probes is {probes}, expected a multiple of replicates, which is {replicates}: "
+                f"{probes + replicates - probes % replicates} would do."
+            )
+        if self.tolerance is not None:
+            if not 0 < self.tolerance < float("inf"):
+                raise ValueError(
+                    f"tolerance is {self.tolerance}, expected a number above 0, such as 0.01."
+                )
+            if replicates < 2:
+                raise ValueError(
+                    "replicates is 1, and one field of signs cannot tell its own error: "
+                    "give replicates=2 or more with a tolerance."
+                )
+
+    @property
+    def _counts(self) -> tuple[int, int]:
+        assert self.probes is not None
+        assert self.replicates is not None
+        return self.probes, self.replicates
+
+    def evaluate(
+        self,
+        f: Function,
+        x: Float[Array, "h w 3"],
+        variance: Float[Array, "h w 3"],
+        key: jax.Array,
+    ) -> Evaluation:
+        value, tangent = jax.linearize(f, x)
+        weight, gain = _weight_and_gain(safe_sqrt(variance), value, self.scale)
+        pixel_colors = colors(*x.shape[:2])
+
+        def sample(probe: Array, replicate: Array) -> Array:
+            pattern = _random.signs(key, replicate, x) * walsh(probe, pixel_colors).astype(x.dtype)
+            return gain * pattern * tangent(weight * pattern)
+
+        probes, replicates = self._counts
+        each = probes // replicates
+        if self.tolerance is not None:
+            return _adaptive.evaluate(
+                sample,
+                each,
+                replicates,
+                value=value,
+                sure_without=(value - x) ** 2 - variance,
+                tolerance=self.tolerance,
+                tile=self.tile,
+                chunk=self.chunk,
+            )
+        return Evaluation(value, *_replicated(sample, each, replicates, self.chunk, value))
+
+
+def _replicated(
+    sample: Callable[[Array, Array], Array], each: int, replicates: int, chunk: int, like: Array
+) -> tuple[Array, Array]:
+    def mean(replicate: Array) -> Array:
+        return accumulate(lambda probe: sample(probe, replicate), each, chunk, like)[0]
+
+    return accumulate(mean, replicates, 1, like)
+
+
+def colors(height: int, width: int) -> Int[Array, "h w 3"]:
+    """Each pixel's colour in 0..1023, by its position alone.
+
+    Reduced modulo 2^n it is a lattice colouring with 2^n colours for each n, the channels shifted.
+    """
+    rows, columns = jnp.arange(height)[:, None, None], jnp.arange(width)[None, :, None]
+    return (columns + _ROW_STEP * rows + jnp.asarray(_CHANNEL_STEPS)) % MOST_PROBES
+
+
+def walsh(probe: Array | int, color: Int[Array, "h w 3"]) -> Int[Array, "h w 3"]:
+    """±1: the Walsh function of this number at each colour, in Hadamard's order.
+
+    The first 2^n of them tell colours apart by their lowest n bits and by nothing else.
+    """
+    shared = jnp.asarray(probe, color.dtype) & color
+    return 1 - 2 * (lax.population_count(shared) & 1)
+
+
+def _weight_and_gain(sigma: Array, value: Array, scale: str) -> tuple[Array, Array]:
+    """w, and σ²/w; formed apart so that nothing under- or overflows between 1e-6 and 1e6."""
+    if scale == "unit":
+        return jnp.ones_like(sigma), sigma**2
+    if scale == "sigma":
+        return sigma, sigma
+    reach = sigma + jnp.abs(value)
+    seen = sigma > 0
+    factor = jnp.where(seen, jnp.where(seen, reach, 1) ** 0.75, 1)
+    return sigma * factor, sigma / factor

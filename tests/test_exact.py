@@ -1,0 +1,249 @@
+"""The exact divergence: unit vectors, colouring and cones against dense Jacobians in float64."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import dense_jacobian_diagonal
+
+import progden_jax as pd
+from progden_jax.denoisers import graph, unet
+from progden_jax.denoisers.graph import Add, Conv, Input, Layered, MaxPool, Relu, Upsample
+from progden_jax.divergence import cone
+
+
+def blur(x):
+    padded = jnp.pad(x, ((2, 2), (1, 1), (0, 0)))
+    near = sum(
+        (0.5 + i + 0.3 * j) * padded[i : i + x.shape[0], j : j + x.shape[1]]
+        for i in range(5)
+        for j in range(3)
+    )
+    return jnp.tanh(near + x[..., ::-1])
+
+
+class Network:
+    """A random network of a graph's layers as a bound denoiser, with pointwise curves around it."""
+
+    def __init__(self, nodes, widths, sizes, seed=0, auxiliary=0):
+        rng = np.random.default_rng(seed)
+        self.nodes, self.params = nodes, {}
+        channels = {}
+        for index, node in enumerate(nodes):
+            if isinstance(node, Input):
+                channels[index] = 3 + auxiliary
+            elif isinstance(node, Conv):
+                taken = sum(channels[s] for s in node.sources)
+                size, width = sizes[node.layer], widths[node.layer]
+                self.params[node.layer] = {
+                    "kernel": jnp.asarray(
+                        rng.normal(size=(size, size, taken, width)) / np.sqrt(taken * size)
+                    ),
+                    "bias": jnp.asarray(0.1 * rng.normal(size=width)),
+                }
+                channels[index] = width
+            else:
+                channels[index] = channels[graph.sources(node)[0]]
+        self.alignment = 1 << max(graph.levels(nodes))
+        self.auxiliary = auxiliary
+
+    @property
+    def layers(self):
+        return self.nodes, self.params
+
+    def layered(self, x):
+        height, width = x.shape[:2]
+        encoded, slope = jax.jvp(jnp.sqrt, (x,), (jnp.ones_like(x),))
+        extra = jnp.broadcast_to(
+            jnp.sin(jnp.arange(self.auxiliary)), (*x.shape[:2], self.auxiliary)
+        )
+        inputs = jnp.concatenate([encoded, extra.astype(x.dtype)], -1)
+        pad = [(0, -n % self.alignment) for n in (height, width)]
+        params = jax.tree.map(lambda p: p.astype(x.dtype), self.params)
+        return Layered(self.nodes, params, jnp.pad(inputs, [*pad, (0, 0)]), None, slope, jnp.tanh)
+
+    def __call__(self, x):
+        shown = self.layered(x)
+        output, _ = graph.evaluate(shown.nodes, shown.params, shown.inputs)
+        return jnp.tanh(output[: x.shape[0], : x.shape[1]])
+
+
+def u_net(depth, pairs):
+    """A U-Net of so many levels with one or two convolutions each, every skip joined."""
+    nodes, skips, names = [Input()], [0], itertools.count()
+
+    def conv(*sources):
+        nodes.extend([Conv(sources, f"c{next(names)}"), Relu(len(nodes))])
+        return len(nodes) - 1
+
+    x = 0
+    for _ in range(depth):
+        for _ in range(pairs):
+            x = conv(x)
+        nodes.append(MaxPool(x))
+        x = len(nodes) - 1
+        skips.append(x)
+    skips.pop()
+    x = conv(x)
+    for skip in reversed(skips):
+        nodes.append(Upsample(x))
+        x = conv(len(nodes) - 1, skip)
+        x = conv(x)
+    nodes.append(Conv((x,), "last"))
+    return tuple(nodes)
+
+
+def residual(blocks):
+    nodes = [Input(), Conv((0,), "in"), Relu(1)]
+    for block in range(blocks):
+        start = len(nodes) - 1
+        nodes.append(Conv((start,), f"a{block}"))
+        nodes.append(Relu(len(nodes) - 1))
+        nodes.append(Conv((len(nodes) - 1,), f"b{block}"))
+        nodes.append(Add((start, len(nodes) - 1)))
+    nodes.append(Conv((len(nodes) - 1,), "last"))
+    return tuple(nodes)
+
+
+def network(nodes, sizes=(3,), seed=0, auxiliary=0):
+    layers = [n.layer for n in nodes if isinstance(n, Conv)]
+    rng = np.random.default_rng(seed)
+    # Nodes that are added must have one width.
+    widths = (
+        dict.fromkeys(layers, 5)
+        if any(isinstance(n, Add) for n in nodes)
+        else {layer: int(rng.integers(3, 7)) for layer in layers}
+    )
+    widths["last"] = 3
+    return Network(
+        nodes,
+        widths,
+        {layer: sizes[i % len(sizes)] for i, layer in enumerate(layers)},
+        seed,
+        auxiliary,
+    )
+
+
+NETWORKS = {
+    "u-net, 1 level": network(u_net(1, 1)),
+    "u-net, 2 levels, auxiliary": network(u_net(2, 1), seed=1, auxiliary=4),
+    "u-net, 3 levels": network(u_net(3, 1), seed=3),
+    "residual": network(residual(2), seed=4),
+    "plain, 5×5 and 3×3": network(residual(0), sizes=(5, 3), seed=5),
+    "1×1": network(residual(1), sizes=(1, 3), seed=6),
+}
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_cone_is_the_dense_diagonal_in_float64(name):
+    """At an odd size with several cells, borders included."""
+    f = NETWORKS[name]
+    with jax.enable_x64(True):
+        x = jnp.asarray(np.random.default_rng(8).random((5, 11, 3)) + 0.1)
+        expected = dense_jacobian_diagonal(f, x)
+        for chunk in (None, 3) if name == "residual" else (None,):
+            method = pd.Exact("cone", chunk=chunk)
+            found = jax.jit(lambda x, m=method: pd.divergence(f, x, jnp.ones_like(x), method=m))(x)
+            np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+        assert np.abs(expected).max() > 1e-3
+
+
+@pytest.mark.parametrize("algorithm", ["basis", "coloring"])
+@pytest.mark.parametrize("chunk", [1, 5])
+def test_any_function_in_float64(algorithm, chunk):
+    with jax.enable_x64(True):
+        x = jnp.asarray(np.random.default_rng(0).normal(size=(7, 9, 3)))
+        variance = jnp.abs(x)
+        method = pd.Exact(algorithm, reach=(2, 1), chunk=chunk)
+        found = pd.divergence_and_error(blur, x, variance, method=method)
+        expected = np.asarray(variance) * dense_jacobian_diagonal(blur, x)
+        np.testing.assert_allclose(found.divergence, expected, rtol=1e-12, atol=1e-14)
+        assert not np.asarray(found.standard_error).any()
+
+
+def test_coloring_needs_its_whole_reach():
+    """One pixel less than the reach gives another answer: the test above can fail."""
+    x = jnp.asarray(np.random.default_rng(0).normal(size=(7, 9, 3)), jnp.float32)
+    one = jnp.ones_like(x)
+    short = pd.divergence(blur, x, one, method=pd.Exact("coloring", reach=(1, 1)))
+    assert np.abs(short - dense_jacobian_diagonal(blur, x)).max() > 1e-3
+
+
+def test_cone_equals_basis_on_oidn(real_frame):
+    """At an odd size, borders included, in float32."""
+    frame = jax.tree.map(lambda a: a[40:59, 30:47] if a.ndim else a, real_frame)
+    denoiser = pd.denoisers.load("oidn-hdr-alb-nrm-small")
+    f = denoiser.bind(frame)
+    found = [
+        np.asarray(pd.divergence(f, frame.color, frame.variance, method=pd.Exact(algorithm)))
+        for algorithm in ("cone", "basis")
+    ]
+    error = np.sqrt(((found[0] - found[1]) ** 2).mean() / (found[1] ** 2).mean())
+    assert error < 1e-5
+
+
+def test_the_graph_is_the_network(real_frame):
+    for name in ("oidn-hdr-alb-small", "oidn-hdr-calb-cnrm-large"):
+        params = pd.denoisers.load(name).params
+        nodes = unet.graph(params)
+        channels = params[nodes[1].layer]["kernel"].shape[2]
+        x = jnp.asarray(np.random.default_rng(0).random((32, 16, channels)), jnp.float32)
+        np.testing.assert_allclose(
+            graph.evaluate(nodes, params, x)[0], unet.apply(params, x), rtol=1e-4, atol=1e-5
+        )
+
+
+def test_auto_takes_the_cheapest(real_frame):
+    frame = jax.tree.map(lambda a: a[:24, :24] if a.ndim else a, real_frame)
+    f = pd.denoisers.load("oidn-hdr").bind(frame)
+    costs = pd.Exact().cost(f, frame.color)
+    assert set(costs) == {"basis", "coloring", "cone"}
+    assert costs["basis"] == 24 * 24 * 3
+    assert 370 < costs["cone"] < 400
+    assert pd.Exact().cost(blur, frame.color) == {"basis": 24 * 24 * 3}
+    assert pd.Exact(reach=(2, 1)).cost(blur, frame.color)["coloring"] == 27
+    one = jnp.ones_like(frame.color)
+    found = pd.divergence(blur, frame.color, one, method=pd.Exact(reach=(2, 1)))
+    expected = dense_jacobian_diagonal(blur, frame.color)
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-5)
+
+
+def test_windows_of_oidn_are_those_of_the_design():
+    params = pd.denoisers.load("oidn-hdr").params
+    nodes = unet.graph(params)
+    plan = cone.plan(nodes, params)
+    sizes = {
+        node.layer: window.size
+        for node, window in zip(plan.nodes, plan.windows, strict=True)
+        if isinstance(node, Conv)
+    }
+    encoder = {f"enc_conv{n}": 5 for n in (1, 2, 3, 4, "5a", "5b")}
+    decoder = {f"dec_conv{n}": 5 for n in ("4b", "3b", "1a")}
+    decoder |= {"dec_conv4a": 7, "dec_conv3a": 7, "dec_conv2a": 6, "dec_conv2b": 4, "dec_conv1b": 3}
+    assert sizes == {"enc_conv0": 3, **encoder, **decoder, "dec_conv0": 1}
+
+
+def test_exact_in_the_pipeline(real_frame):
+    frame = jax.tree.map(lambda a: a[:20, :24] if a.ndim else a, real_frame)
+    denoiser = pd.denoisers.load("oidn-hdr-small")
+    exact = pd.progressive_denoise(frame, denoiser, method=pd.Exact("basis"))
+    many = pd.progressive_denoise(frame, denoiser, method=pd.MonteCarlo(probes=256))
+    error = np.sqrt(((many.divergence - exact.divergence) ** 2).mean())
+    assert error < 0.3 * np.sqrt((exact.divergence**2).mean())
+    assert np.abs(many.divergence - exact.divergence).max() > 0
+
+
+def test_messages():
+    x = jnp.ones((4, 4, 3))
+    with pytest.raises(ValueError, match="expected one of 'auto', 'basis', 'coloring', 'cone'"):
+        pd.Exact("cones")
+    with pytest.raises(ValueError, match="f, a function, does not show its layers"):
+        pd.divergence(blur, x, x, method=pd.Exact("cone"))
+    with pytest.raises(ValueError, match="nothing is known of how far f reaches"):
+        pd.divergence(blur, x, x, method=pd.Exact("coloring"))
+    with pytest.raises(ValueError, match="expected a radius of at least 0"):
+        pd.Exact("coloring", reach=(-1, 1))
+    with pytest.raises(ValueError, match="reads nodes that come later or have several strides"):
+        graph.levels((Input(), Conv((0,), "a"), MaxPool(1), Conv((1, 2), "b")))
