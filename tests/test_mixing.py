@@ -175,11 +175,10 @@ def test_closed_form_is_a_weight_with_finite_gradients(seed, level, flat):
 
 
 @pytest.mark.parametrize("confidence", [0.0, 0.7])
-@pytest.mark.parametrize("size", [(13, 18), (16, 16), (33, 31)])
-def test_gradient_of_the_compiled_closed_form(confidence, size):
+def test_gradient_of_the_compiled_closed_form(confidence):
     """Reverse mode through a jitted call against forward mode; a compiler once got this wrong."""
     rng = np.random.default_rng(0)
-    x = rng.gamma(1, 1, (*size, 3))
+    x = rng.gamma(1, 1, (16, 16, 3))
     variance = 0.1 * x**2 * (rng.random(x.shape) > 0.3)
     direction = rng.normal(size=x.shape)
     for dtype in ("float32", "float64"):
@@ -193,9 +192,9 @@ def test_gradient_of_the_compiled_closed_form(confidence, size):
                 return alpha.sum()
 
             zero = jnp.zeros((), dtype)
-            forward = jax.jvp(total, (zero,), (jnp.ones((), dtype),))[1]
+            forward = jax.jit(lambda s, f=total: jax.jvp(f, (s,), (jnp.ones_like(s),))[1])(zero)
             tolerance = 1e-9 if dtype == "float64" else 2e-3
-            for function in (jax.grad(total), jax.grad(jax.jit(total)), jax.jit(jax.grad(total))):
+            for function in (jax.grad(jax.jit(total)), jax.jit(jax.grad(total))):
                 np.testing.assert_allclose(function(zero), forward, rtol=tolerance)
 
 

@@ -155,16 +155,7 @@ class BoundOIDN:
     def __call__(self, x: Float[Array, "h w 3"]) -> Float[Array, "h w 3"]:
         """The denoised image, (H, W, 3) linear radiance."""
         _checks.image("x", x)
-        inside = _inside(x.shape[:2], self.valid)
-        y = run_unet(
-            self.denoiser.params,
-            (self._encode(x), *self.auxiliary),
-            inside=inside,
-            valid=self.valid,
-            precision=self.denoiser.precision,
-        )
-        y = self._decode(y)
-        return y if inside is None else jnp.where(inside, y, 0)
+        return _run_bound(self, x)
 
     @property
     def receptive_radius(self) -> int:
@@ -201,6 +192,20 @@ class BoundOIDN:
 
     def _decode(self, y: Array) -> Array:
         return transfer.pu_hdr_inverse(y) / self.exposure
+
+
+@jax.jit
+def _run_bound(f: BoundOIDN, x: Array) -> Array:
+    inside = _inside(x.shape[:2], f.valid)
+    y = run_unet(
+        f.denoiser.params,
+        (f._encode(x), *f.auxiliary),
+        inside=inside,
+        valid=f.valid,
+        precision=f.denoiser.precision,
+    )
+    y = f._decode(y)
+    return y if inside is None else jnp.where(inside, y, 0)
 
 
 Valid = tuple[Array | int, Array | int] | None
@@ -247,6 +252,7 @@ def run_unet(
     return y[: x.shape[0], : x.shape[1]]
 
 
+@jax.jit
 def autoexposure(
     color: Float[Array, "h w 3"], *, valid: tuple[Array | int, Array | int] | None = None
 ) -> Float[Array, ""]:
