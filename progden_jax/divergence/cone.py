@@ -131,6 +131,8 @@ def multiply_adds(plan: Plan, params: Any) -> float:
                 continue
             if isinstance(plan.nodes[source], g.Upsample):
                 taps = (window.size * (kernel.shape[0] + 1) // 2) ** 2
+            elif _shifting(origin, window):
+                taps = (kernel.shape[0] * min(origin.size, window.size)) ** 2
             else:
                 taps = sum(_overlap(origin, window, tap)[2] for tap in _taps(kernel.shape[0])) ** 2
             total += (
@@ -162,6 +164,12 @@ def _channels(nodes: Sequence[g.Node], params: Any, index: int) -> int | None:
 
 def _taps(size: int) -> range:
     return range(-(size // 2), size // 2 + 1)
+
+
+def _shifting(source: Window, target: Window) -> bool:
+    """Whether the offset between two windows differs between phases."""
+    shifts = target.origin - source.origin
+    return bool((shifts != shifts[0]).any())
 
 
 def _overlap(source: Window, target: Window, tap: int) -> tuple[int, int, int]:
@@ -271,9 +279,11 @@ class Sweep:
 
     def _convolve_window(self, x: Array, source: Window, weights: Array, target: Window) -> Array:
         """Products of every tap with the pixels where source and target windows overlap."""
-        shifts = target.origin - source.origin
-        if (shifts != shifts[0]).any():
+        if _shifting(source, target):
             r = weights.shape[0] // 2
+            if source.size < target.size:
+                wide = Window(source.origin - r, source.size + 2 * r)
+                return self._move(self._convolve_window(x, source, weights, wide), wide, target)
             wide = Window(target.origin - r, target.size + 2 * r)
             x, source = self._move(x, source, wide), wide
         total = None
@@ -354,14 +364,12 @@ class Sweep:
                     first + column_class, parent_origin, source.size, count, 1
                 )
                 taken = self._take(x, rows, columns, row_count + 1, count + 1, source.size)
-                kernel = kernels[row_even, even]
-                line.append(
-                    sum(
-                        self._product(taken[:, i : i + row_count, j : j + count], kernel[i, j])
-                        for i in (0, 1)
-                        for j in (0, 1)
-                    )
-                )
+                # The four taps side by side make one product: (4 in, out).
+                corners = [
+                    taken[:, i : i + row_count, j : j + count] for i in (0, 1) for j in (0, 1)
+                ]
+                kernel = kernels[row_even, even].reshape(-1, weights.shape[-1])
+                line.append(self._product(jnp.concatenate(corners, axis=-1), kernel))
             blocks.append(_interleave(line[0], line[1], 2, target.size))
         return _interleave(blocks[0], blocks[1], 1, target.size)
 
