@@ -98,6 +98,7 @@ def closed_form_alpha(
     *,
     window: int = 15,
     confidence: float = 0.0,
+    inside: Bool[Array, "h w 1"] | None = None,
 ) -> Float[Array, "h w 3"]:
     """α = σ²(1 − f') / (y − x)², both averaged over a window per channel, clipped to [0, 1].
 
@@ -113,6 +114,7 @@ def closed_form_alpha(
     x, y, variance, divergence : (H, W, 3), see `sure`. Padding around the image must have zero variance
         and y = x.
     window : odd width in pixels.
+    inside : (H, W, 1) False where the arrays are padding around the image.
     confidence : standard errors of evidence to ask for before the render is mixed in; 0 is the paper's form.
 
     Returns
@@ -132,7 +134,8 @@ def closed_form_alpha(
     total, noise = _windows.box_sum(squared, window), _windows.box_sum(variance, window)
     bias = _windows.box_sum(excess, window)
     if confidence:
-        pixels = _windows.box_sum(jnp.ones_like(x[..., :1]), window)
+        counted = jnp.ones_like(x[..., :1]) if inside is None else inside.astype(x.dtype)
+        pixels = jnp.maximum(_windows.box_sum(counted, window), 1)
         largest = jnp.maximum(variance, noise / pixels)
         spread = _windows.box_sum(jnp.minimum(excess**2, 4 * squared * largest), window)
         bias = bias - confidence * safe_sqrt(spread)
@@ -186,7 +189,13 @@ class ClosedForm:
         *,
         inside: Bool[Array, "h w 1"] | None = None,
     ) -> Float[Array, "h w 3"]:
-        del sure, inside
+        del sure
         return closed_form_alpha(
-            x, y, variance, divergence, window=self.window, confidence=self.confidence
+            x,
+            y,
+            variance,
+            divergence,
+            window=self.window,
+            confidence=self.confidence,
+            inside=inside,
         )
