@@ -1,6 +1,7 @@
 """How much of the denoised image to mix in: α from a network or in closed form."""
 
 import dataclasses
+import functools
 from typing import Protocol
 
 import flax.linen as nn
@@ -129,6 +130,19 @@ def closed_form_alpha(
     for name, value in (("y", y), ("variance", variance), ("divergence", divergence)):
         _checks.same_shape(name, value, "x", x)
     _checks.odd_int("window", window)
+    return _closed_form_alpha(x, y, variance, divergence, inside, window, confidence)
+
+
+@functools.partial(jax.jit, static_argnames=("window", "confidence"))
+def _closed_form_alpha(
+    x: Array,
+    y: Array,
+    variance: Array,
+    divergence: Array,
+    inside: Array | None,
+    window: int,
+    confidence: float,
+) -> Array:
     squared = (y - x) ** 2
     excess = squared - (variance - divergence)
     total, noise = _windows.box_sum(squared, window), _windows.box_sum(variance, window)

@@ -1,7 +1,9 @@
 """The confidence bound on α that makes the mix converge to the truth."""
 
+import functools
 import math
 
+import jax
 import jax.numpy as jnp
 from jax import nn
 from jax.scipy import special
@@ -59,7 +61,22 @@ def t_bound(
         _checks.same_shape(name, value, "x", x)
     _checks.odd_int("window", window)
     _checks.choice("sigmoid", sigmoid, _SIGMOIDS)
+    return _t_bound(alpha, x, y, variance, a, c, mean_variance, inside, window, sigmoid)
 
+
+@functools.partial(jax.jit, static_argnames=("window", "sigmoid"))
+def _t_bound(
+    alpha: Array,
+    x: Array,
+    y: Array,
+    variance: Array,
+    a: float,
+    c: float,
+    mean_variance: Array | None,
+    inside: Array | None,
+    window: int,
+    sigmoid: str,
+) -> Array:
     difference = alpha * (y - x)
     if mean_variance is None:
         pixels = x.shape[0] * x.shape[1] if inside is None else jnp.maximum(inside.sum(), 1)

@@ -63,7 +63,7 @@ def test_features_are_symmetric_under_the_swap(images):
 
 def test_network_has_the_contract_shape():
     net = pd.MixingNet()
-    params = net.init(jax.random.key(0), jnp.zeros((8, 9, 18)))["params"]
+    params = jax.jit(net.init)(jax.random.key(0), jnp.zeros((8, 9, 18)))["params"]
     shapes = {k: (v["kernel"].shape, v["bias"].shape) for k, v in params.items()}
     assert shapes == {
         "conv_in": ((5, 5, 18, 48), (48,)),
@@ -72,10 +72,11 @@ def test_network_has_the_contract_shape():
     }
     assert sum(p.size for p in jax.tree.leaves(params)) == 108_681
     features = jax.random.normal(jax.random.key(1), (2, 8, 9, 18))
-    alpha = net.apply({"params": params}, features)
+    apply = jax.jit(net.apply)
+    alpha = np.asarray(apply({"params": params}, features))
     assert alpha.shape == (2, 8, 9, 3)
     assert ((alpha >= 0) & (alpha <= 1)).all()
-    np.testing.assert_allclose(alpha[1], net.apply({"params": params}, features[1]), atol=1e-5)
+    np.testing.assert_allclose(alpha[1], apply({"params": params}, features[1]), atol=1e-5)
     with pytest.raises(ValueError, match="features has shape"):
         net.apply({"params": params}, features[..., :17])
 
@@ -84,7 +85,7 @@ def test_network_against_a_plain_convolution():
     """Order of layers, padding and residuals, in float64 by sums over taps."""
     net = pd.MixingNet(width=5)
     features = np.random.default_rng(0).normal(size=(6, 7, 18))
-    params = net.init(jax.random.key(3), jnp.zeros((6, 7, 18)))["params"]
+    params = jax.jit(net.init)(jax.random.key(3), jnp.zeros((6, 7, 18)))["params"]
     params = jax.tree.map(lambda p: np.asarray(p) + 0.05, params)
 
     def conv(x, name):
@@ -102,7 +103,7 @@ def test_network_against_a_plain_convolution():
         h = np.maximum(h + conv(np.maximum(conv(h, b + "_conv1"), 0), b + "_conv2"), 0)
     x1, x2, x3 = np.split(conv(h, "conv_out"), 3, axis=-1)
     expected = np.clip((x1 - x2) / np.maximum(x3, 1e-6), 0, 1)
-    found = net.apply({"params": params}, features.astype(np.float32))
+    found = jax.jit(net.apply)({"params": params}, features.astype(np.float32))
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
 
 

@@ -138,7 +138,7 @@ def test_gradients_are_finite(images, scale):
         return pd.t_bound(alpha, x, y, variance).sum()
 
     alpha = np.full_like(images.x, 0.5)
-    gradients = jax.grad(total, argnums=(0, 1, 2, 3))(
+    gradients = jax.jit(jax.grad(total, argnums=(0, 1, 2, 3)))(
         alpha, images.x, images.y, scale * images.variance
     )
     assert all(np.isfinite(g).all() for g in gradients)
