@@ -6,7 +6,7 @@ from pathlib import Path
 import jax.numpy as jnp
 
 from progden_jax import _checks
-from progden_jax.denoisers import oidn, unet
+from progden_jax.denoisers import graph, oidn, unet
 from progden_jax.denoisers._base import Bound, Denoiser, FunctionDenoiser
 from progden_jax.denoisers.oidn import OIDN
 from progden_jax.denoisers.tza import read_tza, write_tza
@@ -81,9 +81,8 @@ def load(
 
 
 def _inputs_of(params: unet.Params, *, source: str) -> tuple[str, ...]:
-    first = unet.layout(params)[0][0][0]
-    channels = params[first]["kernel"].shape[2]
-    by_channels = {3: (), 6: ("albedo",), 9: ("albedo", "normal")}
+    channels = graph.input_channels(unet.graph(params), params)
+    by_channels = {3 * (1 + len(inputs)): inputs for inputs in oidn.INPUTS.values()}
     if channels not in by_channels:
         raise ValueError(
             f"{source} holds a network of {channels} input channels; expected 3 (radiance), "

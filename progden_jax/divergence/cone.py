@@ -68,6 +68,10 @@ def plan(nodes: Sequence[g.Node], params: Any) -> Plan:
                 span = None if spans[0] is None else spans[0] >> 1
             case g.Upsample():
                 span = None if spans[0] is None else 2 * spans[0] + np.array([[0], [1]])
+            case g.Filter():
+                image, r = forward[node.image], node.size // 2
+                reached = None if image is None else image + np.array([[-r], [r]])
+                span = _union([reached, forward[node.logits]])
             case _:
                 span = _union(spans)
         forward.append(span)
@@ -86,6 +90,10 @@ def plan(nodes: Sequence[g.Node], params: Any) -> Plan:
                 needed = 2 * span + np.array([[0], [1]])
             case g.Upsample():
                 needed = span >> 1
+            case g.Filter():
+                needed, r = span, node.size // 2
+                around = span + np.array([[-r], [r]])
+                backward[node.image] = _union([backward[node.image], around])
             case _:
                 needed = span
         for source in g.sources(node):
@@ -158,6 +166,8 @@ def _channels(nodes: Sequence[g.Node], params: Any, index: int) -> int | None:
             return None
         case g.Conv():
             return params[node.layer]["kernel"].shape[3]
+        case g.Pointwise(channels=int(first)):
+            return first
         case _:
             return _channels(nodes, params, g.sources(node)[0])
 
@@ -190,7 +200,7 @@ class Sweep:
         self,
         plan: Plan,
         params: Any,
-        kept: dict[int, Array],
+        kept: dict[int, Any],
         phase: tuple[Array, Array],
         cells: tuple[Array, Array],
         precision: Any,
@@ -206,10 +216,13 @@ class Sweep:
             window = plan.windows[index]
             if window is None:
                 continue
+            read = functools.partial(self._read, values, window)
             match node:
                 case g.Input():
                     number = self.cells[0].shape[0]
-                    unit = jnp.eye(3, self._input_channels(), dtype=self._dtype())
+                    unit = jnp.eye(
+                        3, g.input_channels(self.plan.nodes, self.params), dtype=self._dtype()
+                    )
                     value = jnp.broadcast_to(
                         unit[None, :, None, None], (number, 3, 1, 1, unit.shape[1])
                     )
@@ -217,24 +230,27 @@ class Sweep:
                 case g.Conv():
                     value = self._convolve(node, window, values)
                     if index in self.kept:
-                        value = self._scale(
-                            value, self._around(self.kept[index], index, window, False)
-                        )
+                        value = self._scale(value, self._slope(index, window))
                 case g.Relu():
-                    value = self._scale(
-                        values[node.source], self._around(self.kept[index], index, window, False)
-                    )
+                    value = self._scale(read(node.source), self._slope(index, window))
+                case g.LeakyRelu():
+                    slope = self.params[node.layer]["slope"]
+                    slope = jnp.where(self._slope(index, window), 1, slope)
+                    value = self._scale(read(node.source), slope)
+                case g.Affine():
+                    value = read(node.source) * self.params[node.layer]["scale"]
+                case g.Pointwise():
+                    value = read(node.source)[..., : node.channels]
+                    value = self._scale(value, self._slope(index, window))
                 case g.MaxPool():
                     value = self._pool(index, node, window, values[node.source])
                 case g.Upsample():
                     value = values[node.source]  # Read by convolutions, which repeat it themselves.
                 case g.Add():
-                    parts = [
-                        self._move(values[s], self._window(s), window)
-                        for s in node.sources
-                        if s in values
-                    ]
+                    parts = [read(s) for s in node.sources if s in values]
                     value = parts[0] if len(parts) == 1 else parts[0] + parts[1]
+                case g.Filter():
+                    value = self._filter(index, node, window, values)
             values[index] = value
         last = values[len(plan.nodes) - 1]
         return last.reshape(-1, 3, last.shape[-1])
@@ -242,17 +258,14 @@ class Sweep:
     def _dtype(self) -> Any:
         return jax.tree.leaves(self.params)[0].dtype
 
-    def _input_channels(self) -> int:
-        """As many as the first convolution of the input takes."""
-        for node in self.plan.nodes:
-            if isinstance(node, g.Conv) and node.sources == (0,):
-                return self.params[node.layer]["kernel"].shape[2]
-        raise ValueError("no convolution of the graph reads the input alone.")
-
     def _window(self, index: int) -> Window:
         window = self.plan.windows[index]
         assert window is not None
         return window
+
+    def _read(self, values: dict[int, Array], window: Window, source: int) -> Array:
+        """A node's tangents in the window of one that reads it, which may be narrower."""
+        return self._move(values[source], self._window(source), window)
 
     def _convolve(self, node: g.Conv, window: Window, values: dict[int, Array]) -> Array:
         kernel = self.params[node.layer]["kernel"]
@@ -426,7 +439,40 @@ class Sweep:
         assert total is not None
         return total
 
-    def _around(self, kept: Array, index: int, window: Window, outside: int | bool) -> Array:
+    def _filter(
+        self, index: int, node: g.Filter, window: Window, values: dict[int, Array]
+    ) -> Array:
+        """Σ_q w_q dx_q + w_q (x_q − y) dℓ_q over the taps q, w the softmax of the logits ℓ."""
+        r, s, kept = node.size // 2, window.size, self.kept[index]
+        weights = self._around(kept.weights, index, window, 0)
+        result = self._around(kept.result, index, window, 0)
+        wide = Window(window.origin - r, s + 2 * r)
+        image = self._around(kept.image, index, wide, 0)
+        cells = weights.shape[0]
+        total = jnp.zeros((cells, 3, s, s, image.shape[-1]), image.dtype)
+
+        def split(source: int, target: Window) -> Array | None:
+            if source not in values:
+                return None
+            moved = self._read(values, target, source)
+            return moved.reshape(cells, -1, *moved.shape[1:])
+
+        seen, logits = split(node.image, wide), split(node.logits, window)
+        for tap, (i, j) in enumerate(itertools.product(range(node.size), repeat=2)):
+            weight = weights[:, None, ..., tap, None]
+            near = np.s_[i : i + s, j : j + s]
+            if seen is not None:
+                total += weight * seen[:, :, *near]
+            if logits is not None:
+                away = (image[:, *near] - result)[:, None]
+                total += weight * away * logits[..., tap, None]
+        return total.reshape(-1, *total.shape[2:])
+
+    def _slope(self, index: int, window: Window) -> Array:
+        """What the primal pass kept of a pointwise layer, 0 or False beyond the image."""
+        return self._around(self.kept[index], index, window, 0)
+
+    def _around(self, kept: Array, index: int, window: Window, outside: int) -> Array:
         """What the primal pass kept, in every cell's window: (cells, s, s, C)."""
         level, s = self.plan.levels[index], window.size
         reach = 2 * s + int(np.abs(window.origin).max())
@@ -439,10 +485,12 @@ class Sweep:
         cut = functools.partial(lax.dynamic_slice, slice_sizes=(s, s, kept.shape[-1]))
         return jax.vmap(lambda row, column: cut(padded, (row, column, 0)))(*corner)
 
-    def _scale(self, x: Array, passes: Array) -> Array:
-        cells = passes.shape[0]
-        split = x.reshape(cells, -1, *x.shape[1:])
-        return jnp.where(passes[:, None], split, 0).reshape(x.shape)
+    def _scale(self, x: Array, slope: Array) -> Array:
+        """The tangents of every cell times a slope, or where it is a mask, kept."""
+        cells = slope.shape[0]
+        split, slope = x.reshape(cells, -1, *x.shape[1:]), slope[:, None]
+        scaled = jnp.where(slope, split, 0) if slope.dtype == bool else slope * split
+        return scaled.reshape(x.shape)
 
 
 def _interleave(first: Any, second: Any, axis: int, size: int) -> Array:
@@ -460,7 +508,7 @@ def _interleave(first: Any, second: Any, axis: int, size: int) -> Array:
 def jacobian_diagonal(
     plan: Plan,
     params: Any,
-    kept: dict[int, Array],
+    kept: dict[int, Any],
     size: tuple[int, int],
     *,
     chunk: int,
@@ -487,7 +535,7 @@ def assemble(rows: Array, size: tuple[int, int], period: int) -> Float[Array, "h
 def phase_diagonal(
     plan: Plan,
     params: Any,
-    kept: dict[int, Array],
+    kept: dict[int, Any],
     size: tuple[int, int],
     index: Array,
     *,
