@@ -130,7 +130,7 @@ def residual(blocks):
 
 
 def deep_residual(blocks):
-    """Convolution, batch normalisation and PReLU as Wong and Wong 2019 have them, activated before one block."""
+    """As of Wong and Wong 2019, but for a ReLU before the second block and a curve before the last sum."""
     nodes = [Input(), Conv((0,), "in"), LeakyRelu(1, "prelu")]
     start = 2
 
@@ -174,7 +174,7 @@ def network(nodes, sizes=(3,), seed=0, auxiliary=0):
         else {layer: int(rng.integers(3, 7)) for layer in layers}
     )
     widths["last"] = 3
-    widths |= {"kernel": n.size**2 for n in nodes if isinstance(n, Filter)}
+    widths |= {nodes[n.logits].layer: n.size**2 for n in nodes if isinstance(n, Filter)}
     return Network(
         nodes,
         widths,

@@ -48,12 +48,14 @@ class Network:
         self.inputs = inputs
         self.name = name
         self.precision = precision
-        taken, expected = graph.input_channels(self.nodes, params), 3 * (1 + len(inputs))
-        if taken != expected:
+        widths, expected = graph.channels(self.nodes, params), 3 * (1 + len(inputs))
+        if widths[0] != expected:
             raise ValueError(
-                f"the weights of {name} take {taken} input channels; radiance with "
+                f"the weights of {name} take {widths[0]} input channels; radiance with "
                 f"{' and '.join(inputs) or 'nothing else'} makes {expected}."
             )
+        if widths[-1] != 3:
+            raise ValueError(f"the weights of {name} give {widths[-1]} channels, expected 3.")
 
     @property
     def nodes(self) -> tuple[Node, ...]:
@@ -206,7 +208,7 @@ def run(
     valid: Valid = None,
     precision: str = "highest",
 ) -> Float[Array, "h w 3"]:
-    """The network on transferred channels of any size, padded with zeros to its alignment and cropped again."""
+    """The network on transferred channels of any size, padded with zeros to its alignment, cropped again."""
     x = jnp.concatenate(channels, axis=-1)
     inside = _inside(x.shape[:2], valid)
     if inside is not None:

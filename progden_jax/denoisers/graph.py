@@ -43,6 +43,7 @@ __all__ = [
     "Upsample",
     "Weighted",
     "alignment",
+    "channels",
     "children",
     "evaluate",
     "input_channels",
@@ -125,8 +126,41 @@ def receptive_radius(nodes: Sequence[Node], params: Any) -> int:
     return reach[-1]
 
 
+def channels(nodes: Sequence[Node], params: Any) -> list[int]:
+    """Of each node, its channels; the input has as many as the first convolution of it alone takes.
+
+    Raises
+    ------
+    ValueError
+        If the weights of a layer do not fit its place, or no convolution reads the input alone.
+    """
+    widths: list[int] = []
+    for node in nodes:
+        match node:
+            case Input():
+                width = input_channels(nodes, params)
+            case Conv():
+                kernel = params[node.layer]["kernel"].shape
+                width, taken = kernel[-1], sum(widths[s] for s in node.sources)
+                expected = (kernel[0], kernel[0], taken, width)
+                bias = params[node.layer].get("bias")
+                bias_fits = bias is None or bias.shape == (width,)
+                if kernel != expected or kernel[0] % 2 == 0 or not bias_fits:
+                    raise ValueError(
+                        f"layer {node.layer} has a kernel of shape {kernel} and a bias of shape "
+                        f"{getattr(bias, 'shape', None)}; at its place a kernel takes {taken} channels, "
+                        "is square with an odd edge, and has one bias per output channel."
+                    )
+            case Pointwise(channels=int(first)):
+                width = first
+            case _:
+                width = widths[sources(node)[0]]
+        widths.append(width)
+    return widths
+
+
 def input_channels(nodes: Sequence[Node], params: Any) -> int:
-    """As many as the first convolution takes, which reads the input alone."""
+    """As many as the first convolution takes that reads the input alone."""
     for node in nodes:
         if isinstance(node, Conv) and node.sources == (0,):
             return params[node.layer]["kernel"].shape[2]

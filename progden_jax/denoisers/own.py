@@ -36,7 +36,7 @@ INPUT_SETS: dict[str, tuple[str, ...]] = {
 BUFFERS = ("albedo", "normal", "variance")
 
 _LOG_GAIN = math.log(65505) / math.log(2)
-"""Brings the transferred radiance 1 to 1: the transfer leaves it at 1/16, where He's weights expect about 1."""
+"""Brings the transferred radiance 1, which is 1/16, to the size of about 1 that He's weights expect."""
 
 
 class _Own(Network):

@@ -7,6 +7,7 @@ pooled levels and from the input.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+
 import numpy as np
 
 from progden_jax.denoisers._network import Params

@@ -151,25 +151,9 @@ def multiply_adds(plan: Plan, params: Any) -> float:
 
 def _split(plan: Plan, params: Any, node: g.Conv) -> list[slice]:
     """The input channels of a convolution that belong to each of its sources."""
-    widths = [_channels(plan.nodes, params, source) for source in node.sources]
-    known = sum(w for w in widths if w is not None)
-    total = params[node.layer]["kernel"].shape[2]
-    starts = np.cumsum([0, *(total - known if w is None else w for w in widths)])
-    return [slice(int(a), int(b)) for a, b in itertools.pairwise(starts)]
-
-
-def _channels(nodes: Sequence[g.Node], params: Any, index: int) -> int | None:
-    """The channels of a node; None for the input, which the convolutions' weights tell."""
-    node = nodes[index]
-    match node:
-        case g.Input():
-            return None
-        case g.Conv():
-            return params[node.layer]["kernel"].shape[3]
-        case g.Pointwise(channels=int(first)):
-            return first
-        case _:
-            return _channels(nodes, params, g.sources(node)[0])
+    widths = g.channels(plan.nodes, params)
+    ends = np.cumsum([widths[source] for source in node.sources])
+    return [slice(int(e) - widths[s], int(e)) for e, s in zip(ends, node.sources, strict=True)]
 
 
 def _taps(size: int) -> range:
