@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from typing import cast
 
 import jax.numpy as jnp
 
@@ -83,7 +84,10 @@ def load(
     if inputs is not None:
         raise ValueError(f"inputs is {inputs}; only .tza files do not tell, and {text} does.")
     if text in oidn.NAMES:
-        return _shipped_oidn(text, exposure=exposure, precision=precision)
+        base = text.removeprefix("oidn-")
+        kind = base.removesuffix("-small").removesuffix("-large")
+        params = oidn.shipped_params("rt_" + base.replace("-", "_"))
+        return OIDN(params, oidn.INPUTS[kind], exposure=exposure, name=text, precision=precision)
     own = files.shipped()
     if not text.endswith(_safetensors.ENDING) and text not in own:
         raise ValueError(
@@ -95,13 +99,6 @@ def load(
             f"exposure is {exposure}, and {text} is no OIDN network: it takes radiance as it is."
         )
     return files.load_own(own.get(text, Path(text)), precision=precision)
-
-
-def _shipped_oidn(name: str, *, exposure: float | None, precision: str = "highest") -> OIDN:
-    base = name.removeprefix("oidn-")
-    kind = base.removesuffix("-small").removesuffix("-large")
-    params = oidn.shipped_params("rt_" + base.replace("-", "_"))
-    return OIDN(params, oidn.INPUTS[kind], exposure=exposure, name=name, precision=precision)
 
 
 def _inputs_of(params: unet.Params, *, source: str) -> tuple[str, ...]:
@@ -151,7 +148,7 @@ def for_frame(
     if clean_aux and len(found) == 2:
         stem = "oidn-hdr-calb-cnrm"
     name = next(stem + size for size in _SIZES[quality] if stem + size in oidn.NAMES)
-    return _shipped_oidn(name, exposure=exposure)
+    return cast(OIDN, load(name, exposure=exposure))
 
 
 def prefilter(frame: Frame, *, quality: str = "balanced") -> Frame:

@@ -50,6 +50,7 @@ __all__ = [
     "levels",
     "max_pool",
     "multiply_adds",
+    "patches",
     "receptive_radius",
     "sources",
 ]
@@ -261,20 +262,20 @@ def _convolve(layer: Any, x: Array, precision: Any) -> Array:
 def _filter(image: Array, logits: Array, size: int, mask: Array | None) -> Weighted:
     if mask is None:
         mask = jnp.ones((*image.shape[:2], 1), bool)
-    near = jnp.concatenate(_shifts(mask, size), axis=-1)
+    border = ((size // 2,) * 2, (size // 2,) * 2, (0, 0))
+    near = patches(jnp.pad(mask, border), size)[..., 0]
     weights = jax.nn.softmax(jnp.where(near, logits, jnp.finfo(logits.dtype).min), axis=-1)
     weights = jnp.where(mask, weights, 0)
-    result = jnp.zeros_like(image)
-    for tap, shifted in enumerate(_shifts(image, size)):
-        result += weights[..., tap, None] * shifted
-    return Weighted(weights, image, result)
+    around = patches(jnp.pad(image, border), size)
+    return Weighted(weights, image, (weights[..., None] * around).sum(-2))
 
 
-def _shifts(x: Array, size: int) -> list[Array]:
-    """The image as seen from every pixel of size×size around, in raster order, zeros from beyond."""
-    height, width = x.shape[:2]
-    padded = jnp.pad(x, ((size // 2,) * 2, (size // 2,) * 2, (0, 0)))
-    return [padded[i : i + height, j : j + width] for i in range(size) for j in range(size)]
+def patches(x: Float[Array, "*b h w c"], size: int) -> Float[Array, "*b h2 w2 taps c"]:
+    """The size×size pixels in raster order at every place where they all are inside x."""
+    height, width = (n - size + 1 for n in x.shape[-3:-1])
+    rows = jnp.stack([x[..., i : i + height, :, :] for i in range(size)], axis=-2)
+    both = jnp.stack([rows[..., j : j + width, :, :] for j in range(size)], axis=-2)
+    return both.reshape(*x.shape[:-3], height, width, size**2, x.shape[-1])
 
 
 def _not_bounded(nodes: Sequence[Node]) -> set[int]:

@@ -9,7 +9,6 @@ windows and form one batch; offsets that differ between phases are traced, so on
 
 import dataclasses
 import functools
-import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -427,30 +426,25 @@ class Sweep:
         self, index: int, node: g.Filter, window: Window, values: dict[int, Array]
     ) -> Array:
         """Σ_q w_q dx_q + w_q (x_q − y) dℓ_q over the taps q, w the softmax of the logits ℓ."""
-        r, s, kept = node.size // 2, window.size, self.kept[index]
-        weights = self._around(kept.weights, index, window, 0)
-        result = self._around(kept.result, index, window, 0)
-        wide = Window(window.origin - r, s + 2 * r)
-        image = self._around(kept.image, index, wide, 0)
-        cells = weights.shape[0]
-        total = jnp.zeros((cells, 3, s, s, image.shape[-1]), image.dtype)
-
-        def split(source: int, target: Window) -> Array | None:
-            if source not in values:
-                return None
-            moved = self._read(values, target, source)
-            return moved.reshape(cells, -1, *moved.shape[1:])
-
-        seen, logits = split(node.image, wide), split(node.logits, window)
-        for tap, (i, j) in enumerate(itertools.product(range(node.size), repeat=2)):
-            weight = weights[:, None, ..., tap, None]
-            near = np.s_[i : i + s, j : j + s]
-            if seen is not None:
-                total += weight * seen[:, :, *near]
-            if logits is not None:
-                away = (image[:, *near] - result)[:, None]
-                total += weight * away * logits[..., tap, None]
+        kept = self.kept[index]
+        wide = Window(window.origin - node.size // 2, window.size + node.size - 1)
+        weights = self._around(kept.weights, index, window, 0)[..., None]
+        around = g.patches(self._around(kept.image, index, wide, 0), node.size)
+        away = weights * (around - self._around(kept.result, index, window, 0)[..., None, :])
+        parts = []
+        if node.image in values:
+            image = self._per_cell(self._read(values, wide, node.image))
+            parts.append((weights[:, None] * g.patches(image, node.size)).sum(-2))
+        if node.logits in values:
+            logits = self._per_cell(self._read(values, window, node.logits))
+            product = jnp.einsum("nhwtc,ndhwt->ndhwc", away, logits, precision=self.precision)
+            parts.append(product)
+        total = parts[0] if len(parts) == 1 else parts[0] + parts[1]
         return total.reshape(-1, *total.shape[2:])
+
+    def _per_cell(self, x: Array) -> Array:
+        """(cells·3, ...) as (cells, 3, ...)."""
+        return x.reshape(self.cells[0].shape[0], -1, *x.shape[1:])
 
     def _slope(self, index: int, window: Window) -> Array:
         """What the primal pass kept of a pointwise layer, 0 or False beyond the image."""
@@ -471,8 +465,7 @@ class Sweep:
 
     def _scale(self, x: Array, slope: Array) -> Array:
         """The tangents of every cell times a slope, or where it is a mask, kept."""
-        cells = slope.shape[0]
-        split, slope = x.reshape(cells, -1, *x.shape[1:]), slope[:, None]
+        split, slope = self._per_cell(x), slope[:, None]
         scaled = jnp.where(slope, split, 0) if slope.dtype == bool else slope * split
         return scaled.reshape(x.shape)
 
