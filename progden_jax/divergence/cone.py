@@ -217,12 +217,10 @@ class Sweep:
                 case g.Conv():
                     value = self._convolve(node, window, values)
                     if index in self.kept:
-                        value = self._scale(
-                            value, self._around(self.kept[index], index, window, False)
-                        )
+                        value = self._scale(value, self._around(self.kept[index], index, window))
                 case g.Relu():
                     value = self._scale(
-                        values[node.source], self._around(self.kept[index], index, window, False)
+                        values[node.source], self._around(self.kept[index], index, window)
                     )
                 case g.MaxPool():
                     value = self._pool(index, node, window, values[node.source])
@@ -418,7 +416,7 @@ class Sweep:
         batch, _, _, channels = x.shape
         s = window.size
         cells = x.reshape(batch, s, 2, s, 2, channels)
-        codes = self._around(self.kept[index], index, window, 4)
+        codes = self._around(self.kept[index], index, window)
         total = None
         for code in range(4):
             part = self._scale(cells[:, :, code // 2, :, code % 2], codes == code)
@@ -426,18 +424,16 @@ class Sweep:
         assert total is not None
         return total
 
-    def _around(self, kept: Array, index: int, window: Window, outside: int | bool) -> Array:
-        """What the primal pass kept, in every cell's window: (cells, s, s, C)."""
+    def _around(self, kept: Array, index: int, window: Window) -> Array:
+        """What the primal pass kept, with its `surround`, in every cell's window: (cells, s, s, C)."""
         level, s = self.plan.levels[index], window.size
-        reach = 2 * s + int(np.abs(window.origin).max())
-        padded = jnp.pad(kept, ((reach, reach), (reach, reach), (0, 0)), constant_values=outside)
         step = self.plan.period >> level
         corner = [
-            (phase >> level) + jnp.asarray(window.origin)[phase] + reach + step * cell
+            (phase >> level) + jnp.asarray(window.origin)[phase] + _margin(window) + step * cell
             for phase, cell in zip(self.phase, self.cells, strict=True)
         ]
         cut = functools.partial(lax.dynamic_slice, slice_sizes=(s, s, kept.shape[-1]))
-        return jax.vmap(lambda row, column: cut(padded, (row, column, 0)))(*corner)
+        return jax.vmap(lambda row, column: cut(kept, (row, column, 0)))(*corner)
 
     def _scale(self, x: Array, passes: Array) -> Array:
         cells = passes.shape[0]
@@ -457,6 +453,27 @@ def _interleave(first: Any, second: Any, axis: int, size: int) -> Array:
     return lax.slice_in_dim(stacked.reshape(shape), 0, size, axis=axis)
 
 
+def _margin(window: Window) -> int:
+    """How far a cell's window can reach beyond the image."""
+    return window.size + int(np.abs(window.origin).max())
+
+
+def surround(plan: Plan, kept: dict[int, Array]) -> dict[int, Array]:
+    """What the primal pass kept, wherever windows are, with a margin that lets no tangent through.
+
+    Made once, not per chunk: at 1080p OIDN's masks are half a GiB.
+    """
+    found = {}
+    for index, array in kept.items():
+        window = plan.windows[index]
+        if window is not None:
+            # A pooling's codes are 0 to 3: with 4 none of four has won.
+            outside = 4 if isinstance(plan.nodes[index], g.MaxPool) else 0
+            widths = [(_margin(window), _margin(window))] * 2 + [(0, 0)]
+            found[index] = jnp.pad(array, widths, constant_values=outside)
+    return found
+
+
 def jacobian_diagonal(
     plan: Plan,
     params: Any,
@@ -466,51 +483,59 @@ def jacobian_diagonal(
     chunk: int,
     precision: Any,
 ) -> Float[Array, "h w 3"]:
-    """∂output_pc/∂input_pc of a network at every pixel and channel, (H, W, 3), over all phases."""
-    period = plan.period
+    """∂output_pc/∂input_pc of a network at every pixel and channel, (H, W, 3), over all phases.
+
+    `kept` is what `graph.evaluate` gives.
+    """
+    kept = surround(plan, kept)
+    count = cells_per_phase(plan, size)
     rows = lax.map(
-        lambda index: phase_diagonal(
-            plan, params, kept, size, index, chunk=chunk, precision=precision
+        lambda phase: some_cells(
+            plan, params, kept, size, phase, 0, count, chunk=chunk, precision=precision
         ),
-        jnp.arange(period * period),
+        jnp.arange(plan.period**2),
     )
-    return assemble(rows, size, period)
+    return assemble(rows, size, plan.period)
 
 
-def assemble(rows: Array, size: tuple[int, int], period: int) -> Float[Array, "h w 3"]:
-    """The image from its phases, (period², H/period, W/period, 3)."""
+def assemble(rows: Any, size: tuple[int, int], period: int) -> Any:
+    """The image (H, W, 3) from its phases' cells, (period², cells, 3), of JAX or NumPy."""
     height, width = size
     split = rows.reshape(period, period, height // period, width // period, 3)
     return split.transpose(2, 0, 3, 1, 4).reshape(height, width, 3)
 
 
-def phase_diagonal(
+def cells_per_phase(plan: Plan, size: tuple[int, int]) -> int:
+    """Pixels of each phase in a padded image of this size."""
+    return (size[0] // plan.period) * (size[1] // plan.period)
+
+
+def some_cells(
     plan: Plan,
     params: Any,
-    kept: dict[int, Array],
+    surrounded: dict[int, Array],
     size: tuple[int, int],
-    index: Array,
+    phase: Array,
+    first: Array | int,
+    number: int,
     *,
     chunk: int,
     precision: Any,
-) -> Float[Array, "h w 3"]:
-    """The diagonal at the pixels of one phase, (H/period, W/period, 3), `chunk` of them at once."""
-    period = plan.period
-    across = size[1] // period
-    count = (size[0] // period) * across
-    chunk = min(chunk, count)
-    phase = (index // period, index % period)
+) -> Float[Array, "cells 3"]:
+    """The diagonal at `number` pixels of a phase from the `first` on, `chunk` of them at once.
 
-    def some(first: Array) -> Array:
-        # The last chunk reaches back over cells already done instead of past the end.
-        cells = jnp.minimum(first, count - chunk) + jnp.arange(chunk)
-        sweep = Sweep(plan, params, kept, phase, (cells // across, cells % across), precision)
+    `phase` and `first` may be traced. Beyond the last pixel of the phase the last one is repeated.
+    """
+    period = plan.period
+    across, last = size[1] // period, cells_per_phase(plan, size) - 1
+    chunk = min(chunk, number)
+    place = (phase // period, phase % period)
+
+    def some(start: Array) -> Array:
+        cells = jnp.minimum(start + jnp.arange(chunk), last)
+        split = (cells // across, cells % across)
+        sweep = Sweep(plan, params, surrounded, place, split, precision)
         return jnp.diagonal(sweep.run(), axis1=1, axis2=2)
 
-    starts = jnp.arange(0, count, chunk)
-    found = lax.map(some, starts)
-    whole = count // chunk * chunk
-    flat = found[: count // chunk].reshape(whole, 3)
-    if whole < count:
-        flat = jnp.concatenate([flat, found[-1][chunk - (count - whole) :]])
-    return flat.reshape(size[0] // period, across, 3)
+    found = lax.map(some, first + jnp.arange(0, number, chunk))
+    return found.reshape(-1, 3)[:number]
