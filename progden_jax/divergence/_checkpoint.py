@@ -71,7 +71,7 @@ def load(path: Path, key: str, found: np.ndarray) -> int:
     if not path.exists():
         return 0
     try:
-        with np.load(path) as stored:
+        with path.open("rb") as file, np.load(file) as stored:
             held, values, done = str(stored["key"]), stored["found"], int(stored["done"])
     except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
         logger.warning("%s is no whole checkpoint (%s): starting over", os.fspath(path), error)

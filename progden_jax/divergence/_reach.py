@@ -83,11 +83,22 @@ def _follow(jaxpr: core.Jaxpr, arguments: Sequence[_Spans | None]) -> list[_Span
         return None if isinstance(variable, core.Literal) else known.get(variable)
 
     bind(jaxpr.invars, arguments)
-    for equation in jaxpr.eqns:
+    for equation in _needed(jaxpr):
         inputs = [of(v) for v in equation.invars]
         if any(s is not None for s in inputs):
             bind(equation.outvars, _apply(equation, inputs))
     return [of(v) for v in jaxpr.outvars]
+
+
+def _needed(jaxpr: core.Jaxpr) -> list[Any]:
+    """The equations that outputs are computed from: tangents that are stopped later are not followed."""
+    wanted = {v for v in jaxpr.outvars if not isinstance(v, core.Literal)}
+    kept = []
+    for equation in reversed(jaxpr.eqns):
+        if not wanted.isdisjoint(equation.outvars):
+            kept.append(equation)
+            wanted.update(v for v in equation.invars if not isinstance(v, core.Literal))
+    return kept[::-1]
 
 
 def _apply(equation: Any, inputs: list[_Spans | None]) -> Sequence[_Spans | None]:
