@@ -18,6 +18,7 @@ from progden_jax.divergence import (
     Probing,
     divergence,
     divergence_and_error,
+    exact_divergence,
 )
 from progden_jax.exr import ExrError, describe_exr, read_exr, write_exr
 from progden_jax.frame import Frame, Repairs, repair
@@ -50,6 +51,7 @@ __all__ = [
     "divergence",
     "divergence_and_error",
     "enable_compilation_cache",
+    "exact_divergence",
     "metrics",
     "mixing_features",
     "progressive_denoise",

@@ -58,6 +58,7 @@ def progressive_denoise(
     mixer: Mixer | None = None,
     method: Method | None = None,
     key: jax.Array | None = None,
+    divergence: Float[Array, "h w 3"] | None = None,
 ) -> Result:
     """The mix of render and denoised image that converges to the truth as samples grow.
 
@@ -72,11 +73,15 @@ def progressive_denoise(
     mixer : gives α; by default the closed form over 15×15 windows.
     method : estimator of the divergence; by default `MonteCarlo` with one probe.
     key : of the random probes; None stands for ``jax.random.key(0)``.
+    divergence : σ²·∂f/∂x where it is known already, as from `exact_divergence`, of
+        ``denoiser.bind(frame)`` for a frame whose bad pixels are repaired (`progden_jax.repair`); then there
+        is no method to choose.
 
     Raises
     ------
     ValueError
-        If the frame has no variance, is no single image, or lacks what the denoiser takes.
+        If the frame has no variance, is no single image, or lacks what the denoiser takes; if the
+        divergence is no image of its size, or comes with a method.
 
     Notes
     -----
@@ -89,10 +94,18 @@ def progressive_denoise(
             "make one from half-buffers or several seeds (read_exr's variance_from), or denoise "
             "plainly with `denoise(frame, denoiser)`."
         )
+    if divergence is not None:
+        _checks.same_shape("divergence", divergence, "frame.color", frame.color)
+        if method is not None:
+            raise ValueError(
+                f"a divergence is given and a method, {method!r}, to find it: give one of them."
+            )
     mixer = DEFAULT_MIXER if mixer is None else mixer
     method = DEFAULT_METHOD if method is None else method
     key = jax.random.key(0) if key is None else key
-    return _on_canvas(_progressive, frame, denoiser, mixer, key, method=method)
+    return _on_canvas(
+        _progressive, frame, denoiser, mixer, key, images=(divergence,), method=method
+    )
 
 
 def denoise(frame: Frame, denoiser: Denoiser) -> Denoised:
@@ -108,6 +121,7 @@ Valid = tuple[Int[Array, ""], Int[Array, ""]]
 def _progressive(
     frame: Frame,
     denoiser: Denoiser,
+    divergence: Array | None,
     mixer: Mixer,
     key: jax.Array,
     valid: Valid | None = None,
@@ -116,7 +130,11 @@ def _progressive(
 ) -> Result:
     frame, inside, repairs = _prepare(frame, valid)
     x, variance = frame.color, cast(Array, frame.variance)
-    y, divergence, *_ = method.evaluate(_bind(denoiser, frame, valid), x, variance, key)
+    f = _bind(denoiser, frame, valid)
+    if divergence is None:
+        y, divergence, *_ = method.evaluate(f, x, variance, key)
+    else:
+        y = f(x)
     risk = sure(x, y, variance, divergence)
     alpha = mixer(x, y, variance, divergence, risk, inside=inside)
     alpha = t_bound(alpha, x, y, variance, inside=inside)
@@ -148,23 +166,37 @@ def canvas_size(n: int) -> int:
     return -(-n // step) * step
 
 
-def _on_canvas(run: Any, frame: Frame, denoiser: Denoiser, *arguments: Any, **static: Any) -> Any:
-    """`run` on the frame padded to its canvas, cropped again, unless tracing or the denoiser forbids it."""
+def _on_canvas(
+    run: Any,
+    frame: Frame,
+    denoiser: Denoiser,
+    *arguments: Any,
+    images: tuple[Array | None, ...] = (),
+    **static: Any,
+) -> Any:
+    """`run` on the frame and images padded to its canvas, cropped again, unless tracing or the
+    denoiser forbids it."""
     size = frame.size
     canvas = tuple(canvas_size(n) for n in size)
-    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((frame, denoiser)))
+    leaves = jax.tree.leaves((frame, denoiser, images))
+    traced = any(isinstance(leaf, Tracer) for leaf in leaves)
     if traced or not getattr(denoiser, "canvas", False):
-        return run(frame, denoiser, *arguments, **static)
+        return run(frame, denoiser, *images, *arguments, **static)
     padding = [(0, big - small) for big, small in zip(canvas, size, strict=True)] + [(0, 0)]
+
+    def pad(buffer: Array) -> Any:
+        return np.pad(np.asarray(buffer), padding) if canvas != size else buffer
+
     padded = {}
     for name in ("color", "variance", "albedo", "normal", "depth"):
         buffer = getattr(frame, name)
         if buffer is not None:
-            padded[name] = np.pad(np.asarray(buffer), padding) if canvas != size else buffer
+            padded[name] = pad(buffer)
     valid = tuple(np.int32(n) for n in size)
     result = run(
         Frame(padded.pop("color"), padded.pop("variance", None), **padded),
         denoiser,
+        *(None if image is None else pad(image) for image in images),
         *arguments,
         valid,
         **static,

@@ -1,5 +1,6 @@
 """The `progden` command through real files: in this process by `main`, and as a program of its own."""
 
+import importlib
 import itertools
 import json
 import os
@@ -797,6 +798,60 @@ def test_devices(progden):
 
 
 # As a program of its own.
+
+
+INTERRUPT_ITSELF = """
+import importlib, os, signal, sys
+from progden_jax.cli import main
+
+calls = []
+
+def follow(bars, done, total):
+    calls.append(done)
+    if len(calls) == 5:
+        os.kill(os.getpid(), signal.SIGINT)
+
+importlib.import_module("progden_jax.cli.denoise")._Bars.follow = follow
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_an_interrupted_exact_divergence_is_resumed(tmp_path, frames, progden, monkeypatch):
+    """By the same command, to the same bits; nothing of it is left then."""
+    path, out = tmp_path / "room.exr", tmp_path / "clean.exr"
+    write_exr(path, jax.tree.map(lambda a: a[:6, :7] if np.ndim(a) else a, frames[8]))
+    saved = ["--save", "divergence,sure"]
+    call = [
+        "denoise",
+        path,
+        "-o",
+        out,
+        "--method",
+        "exact",
+        "--no-aux",
+        "--quality",
+        "fast",
+        *saved,
+    ]
+    program = [sys.executable, "-c", INTERRUPT_ITSELF, *map(str, call)]
+    broken = subprocess.run(program, capture_output=True, text=True, timeout=300, check=False)
+    (kept,) = (Path(os.environ["PROGDEN_CACHE"]) / "exact").iterdir()
+    assert broken.returncode == 130
+    assert f"{path}: 13% of the exact divergence are kept in {kept}" in broken.stderr
+    assert not out.exists()
+
+    starts = []
+    bars = importlib.import_module("progden_jax.cli.denoise")._Bars
+    monkeypatch.setattr(bars, "follow", lambda bars, done, total: starts.append(done))
+    assert progden(*call)[::2] == (0, "")
+    assert starts[0] == 16
+    assert not kept.exists()
+    resumed, _ = read_channels(out)
+    assert progden(*call, "--force")[::2] == (0, "")
+    again, _ = read_channels(out)
+    assert resumed.keys() == again.keys() > {"divergence.R", "R"}
+    for name, values in again.items():
+        np.testing.assert_array_equal(resumed[name], values)
 
 
 def shell(command: str, *, cwd: Path, **settings) -> subprocess.CompletedProcess:

@@ -1,5 +1,7 @@
 """The exact divergence: unit vectors, colouring and cones against dense Jacobians in float64."""
 
+import copy
+import functools
 import itertools
 
 import jax
@@ -219,13 +221,15 @@ def test_cone_is_the_dense_diagonal_in_float64(name):
         assert np.abs(expected).max() > 1e-3
 
 
-@pytest.mark.parametrize("algorithm", ["basis", "coloring"])
-@pytest.mark.parametrize("chunk", [1, 5])
-def test_any_function_in_float64(algorithm, chunk):
+@pytest.mark.parametrize(
+    ("algorithm", "reach", "chunk"),
+    [("basis", None, 5), ("coloring", (2, 1), 1), ("coloring", None, 1), ("coloring", None, 5)],
+)
+def test_any_function_in_float64(algorithm, reach, chunk):
     with jax.enable_x64(True):
         x = jnp.asarray(np.random.default_rng(0).normal(size=(7, 9, 3)))
         variance = jnp.abs(x)
-        method = pd.Exact(algorithm, reach=(2, 1), chunk=chunk)
+        method = pd.Exact(algorithm, reach=reach, chunk=chunk)
         found = pd.divergence_and_error(blur, x, variance, method=method)
         expected = np.asarray(variance) * dense_jacobian_diagonal(blur, x)
         np.testing.assert_allclose(found.divergence, expected, rtol=1e-12, atol=1e-14)
@@ -253,6 +257,39 @@ def test_cone_equals_basis_on_oidn(real_frame):
     assert error < 1e-5
 
 
+@pytest.mark.parametrize("algorithm", ["coloring", "cone"])
+def test_gradient_in_the_weights_and_batches(algorithm):
+    """Along a random direction of all weights, against differences; a batch under vmap is each image alone.
+
+    "basis" is "coloring" with more colours.
+    """
+    nodes = (Input(), Conv((0,), "a"), Relu(1), MaxPool(2), Upsample(3), Conv((4, 0), "last"))
+    net, rng = network(nodes, sizes=(1, 3), seed=2), np.random.default_rng(3)
+    method = pd.Exact(algorithm, chunk=2, reach=(3, 1))
+    with jax.enable_x64(True):
+        x = jnp.asarray(rng.random((2, 3, 4, 3)) + 0.1)
+        towards = jax.tree.map(lambda p: jnp.asarray(rng.normal(size=p.shape)), net.params)
+
+        def mean(step, x):
+            moved = copy.copy(net)
+            moved.params = jax.tree.map(lambda p, d: p + step * d, net.params, towards)
+            return pd.divergence(moved, x, jnp.ones_like(x), method=method).mean()
+
+        @jax.jit
+        def run(step):
+            gradient = jax.grad(lambda s: jax.vmap(mean, (None, 0))(s, x)[0])(step)
+            return jax.vmap(mean, (None, 0))(step, x), gradient
+
+        batch, gradient = run(0.0)
+        h = 1e-6
+        difference = (run(h)[0][0] - run(-h)[0][0]) / (2 * h)
+        np.testing.assert_allclose(gradient, difference, rtol=1e-6)
+        assert abs(gradient) > 1e-2
+        compiled = jax.jit(lambda x: net(x))
+        expected = [dense_jacobian_diagonal(compiled, one).mean() for one in np.asarray(x)]
+        np.testing.assert_allclose(batch, expected, rtol=1e-10)
+
+
 def test_auto_takes_the_cheapest(real_frame):
     frame = jax.tree.map(lambda a: a[:24, :24] if a.ndim else a, real_frame)
     f = pd.denoisers.load("oidn-hdr").bind(frame)
@@ -260,7 +297,9 @@ def test_auto_takes_the_cheapest(real_frame):
     assert set(costs) == {"basis", "coloring", "cone"}
     assert costs["basis"] == 24 * 24 * 3
     assert 370 < costs["cone"] < 400
-    assert pd.Exact().cost(blur, frame.color) == {"basis": 24 * 24 * 3}
+    assert pd.Exact().cost(blur, frame.color) == {"basis": 24 * 24 * 3, "coloring": 3 * 3 * 2}
+    by_rows = functools.partial(jax.lax.map, jnp.tanh)
+    assert pd.Exact().cost(by_rows, frame.color) == {"basis": 24 * 24 * 3}
     assert pd.Exact(reach=(2, 1)).cost(blur, frame.color)["coloring"] == 27
     one = jnp.ones_like(frame.color)
     found = pd.divergence(blur, frame.color, one, method=pd.Exact(reach=(2, 1)))
@@ -290,6 +329,14 @@ def test_exact_in_the_pipeline(real_frame):
     many = pd.progressive_denoise(frame, denoiser, method=pd.MonteCarlo(probes=256))
     error = np.sqrt(((many.divergence - exact.divergence) ** 2).mean())
     assert error < 0.3 * np.sqrt((exact.divergence**2).mean())
+    given = pd.progressive_denoise(frame, denoiser, divergence=np.asarray(exact.divergence))
+    np.testing.assert_array_equal(given.divergence, exact.divergence)
+    np.testing.assert_allclose(given.sure, exact.sure, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(given.image, exact.image, rtol=1e-4, atol=1e-5)
+    with pytest.raises(ValueError, match="a divergence is given and a method, Exact"):
+        pd.progressive_denoise(frame, denoiser, divergence=given.sure, method=pd.Exact())
+    with pytest.raises(ValueError, match="divergence has shape"):
+        pd.progressive_denoise(frame, denoiser, divergence=given.sure[1:])
     assert np.abs(many.divergence - exact.divergence).max() > 0
 
 
@@ -299,8 +346,8 @@ def test_messages():
         pd.Exact("cones")
     with pytest.raises(ValueError, match="f, a function, does not show its layers"):
         pd.divergence(blur, x, x, method=pd.Exact("cone"))
-    with pytest.raises(ValueError, match="nothing is known of how far f reaches"):
-        pd.divergence(blur, x, x, method=pd.Exact("coloring"))
+    with pytest.raises(ValueError, match=r"primitive 'scan', which is not followed. Give Exact\("):
+        pd.divergence(functools.partial(jax.lax.map, jnp.tanh), x, x, method=pd.Exact("coloring"))
     with pytest.raises(ValueError, match="expected a radius of at least 0"):
         pd.Exact("coloring", reach=(-1, 1))
     with pytest.raises(ValueError, match="reads nodes that come later or have several strides"):

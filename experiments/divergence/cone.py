@@ -46,18 +46,22 @@ def main() -> None:
     f: Any = pd.denoisers.load(arguments.denoiser).bind(pd.Frame(color, color, normal, normal))
     nodes, params = f.layers
     plan = cone.plan(nodes, params)
+    cells = cone.cells_per_phase(plan, size)
 
     def primal(f: Any, x: jax.Array) -> Any:
         shown = f.layered(x)
-        return graph.evaluate(shown.nodes, shown.params, shown.inputs)
+        output, kept = graph.evaluate(shown.nodes, shown.params, shown.inputs)
+        return output, cone.surround(plan, kept)
 
     def phase(params: Any, kept: Any, index: jax.Array) -> jax.Array:
-        return cone.phase_diagonal(
+        return cone.some_cells(
             plan,
             params,
             kept,
             size,
             index,
+            0,
+            cells,
             chunk=arguments.chunk,
             precision=jax.lax.Precision.HIGHEST,
         )
@@ -69,10 +73,17 @@ def main() -> None:
     compile_time = time.perf_counter() - start
 
     # XLA counts a loop's body once: operations are counted on one chunk that holds all cells of a phase.
-    cells = size[0] * size[1] // plan.period**2
     counted = jax.jit(
-        lambda params, kept, index: cone.phase_diagonal(
-            plan, params, kept, size, index, chunk=cells, precision=jax.lax.Precision.HIGHEST
+        lambda params, kept, index: cone.some_cells(
+            plan,
+            params,
+            kept,
+            size,
+            index,
+            0,
+            cells,
+            chunk=cells,
+            precision=jax.lax.Precision.HIGHEST,
         )
     ).lower(params, kept, jnp.int32(0))
     flops: Any = counted.cost_analysis()

@@ -1,8 +1,10 @@
 """One file from input to output: read, denoise, mix, measure, write."""
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -11,7 +13,9 @@ import progden_jax as pd
 from progden_jax.cli._compare import Scores, compare
 from progden_jax.cli._options import SAVE_ALWAYS, EstimateOptions, NetworkOptions, ReadOptions
 from progden_jax.cli._paths import Item
-from progden_jax.cli._run import Failure
+from progden_jax.cli._run import Failure, complain
+from progden_jax.compilation import cache_folder
+from progden_jax.divergence.running import ExactRun
 from progden_jax.exr import ExrInfo, read_exr_with_info, write_exr
 
 
@@ -84,8 +88,14 @@ class _Images(NamedTuple):
     maps: dict[str, np.ndarray]
 
 
-def process(item: Item, settings: Settings, outcome: Outcome) -> None:
+Progress = Callable[[int, int], None]
+"""Called with how much of something long is done, and of how much."""
+
+
+def process(item: Item, settings: Settings, outcome: Outcome, progress: Progress) -> None:
     """Denoise one file, filling in `outcome` as things become known.
+
+    `progress` follows an exact divergence, which may take an hour.
 
     Raises
     ------
@@ -103,10 +113,12 @@ def process(item: Item, settings: Settings, outcome: Outcome) -> None:
     frame = _with_usable_variance(frame, info, outcome)
     frame, denoiser = settings.network.load(frame)
     outcome.denoiser, outcome.auxiliary = denoiser.name, denoiser.inputs
-    images = _denoise(frame, denoiser, settings.estimate, outcome)
+    images, checkpoint = _denoise(frame, denoiser, settings.estimate, outcome, progress)
     if reference is not None:
         outcome.metrics = _measure(images, reference)
     _write(item, images, info, settings, outcome)
+    if checkpoint is not None:
+        checkpoint.unlink(missing_ok=True)
     outcome.seconds = round(time.perf_counter() - start, 3)
     outcome.ok = True
 
@@ -152,8 +164,14 @@ def _repaired(frame: pd.Frame) -> np.ndarray:
 
 
 def _denoise(
-    frame: pd.Frame, denoiser: pd.Denoiser, estimate: EstimateOptions, outcome: Outcome
-) -> _Images:
+    frame: pd.Frame,
+    denoiser: pd.Denoiser,
+    estimate: EstimateOptions,
+    outcome: Outcome,
+    progress: Progress,
+) -> tuple[_Images, Path | None]:
+    """The images, and a file to be removed once they are written."""
+    checkpoint = None
     if frame.variance is None:
         outcome.mode = "plain"
         denoised, repairs = pd.denoise(frame, denoiser)
@@ -162,9 +180,11 @@ def _denoise(
     else:
         method = estimate.build()
         outcome.mode, outcome.method = "progressive", repr(method)
-        result = pd.progressive_denoise(
-            frame, denoiser, method=method, key=jax.random.key(estimate.seed)
-        )
+        how: dict[str, Any] = {"method": method}
+        if isinstance(method, pd.Exact):
+            divergence, checkpoint = _exactly(frame, denoiser, method, outcome, progress)
+            how = {"divergence": divergence}
+        result = pd.progressive_denoise(frame, denoiser, key=jax.random.key(estimate.seed), **how)
         repairs, image = result.repairs, np.asarray(result.image)
         names = ("alpha", "denoised", "sure", "divergence")
         maps = {name: np.asarray(getattr(result, name)) for name in names}
@@ -175,7 +195,33 @@ def _denoise(
     outcome.repairs = {name: int(n) for name, n in repairs._asdict().items()}
     if not np.isfinite(image).all():
         raise Failure(f"{outcome.input}: the result is not finite; nothing was written.")
-    return _Images(image, frame, maps)
+    return _Images(image, frame, maps), checkpoint
+
+
+def _exactly(
+    frame: pd.Frame,
+    denoiser: pd.Denoiser,
+    method: pd.Exact,
+    outcome: Outcome,
+    progress: Progress,
+) -> tuple[jax.Array, Path | None]:
+    """The exact divergence, and the checkpoint that holds it."""
+    repaired = jax.jit(pd.repair)(frame)[0]
+    run = ExactRun(denoiser.bind(repaired), repaired.color, repaired.variance, method=method)
+    checkpoint: Path | None = cache_folder() / "exact" / f"{run.key}.npz"
+    try:
+        checkpoint.parent.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        checkpoint = None
+    try:
+        return run.finish(progress=progress, checkpoint=checkpoint).divergence, checkpoint
+    except KeyboardInterrupt:
+        if checkpoint is not None and checkpoint.exists():
+            complain(
+                f"{outcome.input}: {run.done / run.total:.0%} of the exact divergence are kept in "
+                f"{checkpoint}; the same command goes on from there"
+            )
+        raise
 
 
 def _measure(images: _Images, reference: np.ndarray) -> Scores:

@@ -1,9 +1,8 @@
 """`progden denoise`: files in, files out."""
 
-import contextlib
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -21,7 +20,9 @@ from progden_jax.cli._paths import Item, plan
 from progden_jax.cli._run import FAILED, OK, UsageError, complain, explain, print_json, tables
 
 if TYPE_CHECKING:
-    from progden_jax.cli._job import Outcome
+    from rich.progress import TaskID
+
+    from progden_jax.cli._job import Outcome, Progress
 
 HELP = """Denoise renders progressively: mix each with its denoised version so that it stays true.
 
@@ -86,29 +87,38 @@ def denoise(
 
     enable_compilation_cache()
     settings = Settings(read, network, estimate, saved, half, force)
-    return _run_all(items, lambda item, outcome: process(item, settings, outcome), json=json)
+    return _run_all(
+        items,
+        lambda item, outcome, progress: process(item, settings, outcome, progress),
+        json=json,
+    )
 
 
-def _run_all(items: list[Item], process: Callable[[Item, "Outcome"], None], *, json: bool) -> int:
+def _run_all(
+    items: list[Item],
+    process: "Callable[[Item, Outcome, Progress], None]",
+    *,
+    json: bool,
+) -> int:
     """Every file in turn, one that fails keeping no other; the exit status."""
     from progden_jax.cli._job import Outcome
 
     outcomes: list[Outcome] = []
     try:
-        with _progress(len(items), enabled=len(items) > 1) as (advance, show):
+        with _Bars(len(items)) as bars:
             for item in items:
-                advance(item.input.name)
+                bars.advance(item.input.name)
                 outcome = Outcome(str(item.input), str(item.output))
                 outcomes.append(outcome)
                 try:
-                    process(item, outcome)
+                    process(item, outcome, bars.follow)
                 except Exception as error:
                     outcome.error = explain(error)
                     complain(_about(outcome.input, outcome.error))
                 for warning in outcome.warnings:
                     complain(_about(outcome.input, f"warning: {warning}"))
                 if outcome.ok and not json:
-                    show(outcome.line())
+                    bars.show(outcome.line())
     except KeyboardInterrupt:
         outcomes = [o for o in outcomes if o.ok or o.error]
         complain(f"{sum(o.ok for o in outcomes)} of {len(items)} files were done")
@@ -130,42 +140,72 @@ def _about(path: str, message: str) -> str:
     return message if message.startswith(path) else f"{path}: {message}"
 
 
-@contextlib.contextmanager
-def _progress(
-    total: int, *, enabled: bool
-) -> Iterator[tuple[Callable[[str], None], Callable[[str], None]]]:
-    """A bar on stderr if that is a terminal: `advance` to the next file, `show` a line on stdout."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+class _Bars:
+    """Progress on stderr if that is a terminal: of the files if they are many, and of what is long."""
 
-    console = Console(stderr=True)
-    columns = (
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("{task.fields[name]}", markup=False),
-    )
-    bar = Progress(
-        *columns,
-        console=console,
-        disable=not (enabled and console.is_terminal),
-        transient=True,
-        redirect_stdout=False,
-    )
-    task = bar.add_task("", total=total, name="", completed=-1)
+    def __init__(self, total: int) -> None:
+        from rich.console import Console
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            Progress,
+            TextColumn,
+            TimeElapsedColumn,
+            TimeRemainingColumn,
+        )
 
-    def advance(name: str) -> None:
-        bar.update(task, advance=1, name=name)
+        self.console = Console(stderr=True)
+        self.bars = Progress(
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[name]}", markup=False),
+            TimeRemainingColumn(),
+            console=self.console,
+            disable=not self.console.is_terminal,
+            transient=True,
+            redirect_stdout=False,
+        )
+        self.many = total > 1
+        self.files = self.bars.add_task("", total=total, name="", completed=-1, visible=self.many)
+        self.part: TaskID | None = None
+        self.name = ""
 
-    def show(line: str) -> None:
-        # On one terminal the bar has to make room; a redirected stdout must get its own lines.
-        if bar.disable or not sys.stdout.isatty():
+    def __enter__(self) -> "_Bars":
+        if self.many:
+            self.bars.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.bars.stop()
+
+    def advance(self, name: str) -> None:
+        """On to the next file."""
+        self._end_part()
+        self.name = name
+        self.bars.update(self.files, advance=1, name=name)
+
+    def follow(self, done: int, total: int) -> None:
+        """Of the exact divergence of a file, in percent."""
+        if self.part is None:
+            self.bars.start()
+            label = f"% of the exact divergence of {self.name}"
+            self.part = self.bars.add_task("", total=100, name=label)
+        self.bars.update(self.part, completed=100 * done // total)
+        if done == total:
+            self._end_part()
+
+    def _end_part(self) -> None:
+        if self.part is not None:
+            self.bars.remove_task(self.part)
+            self.part = None
+
+    def show(self, line: str) -> None:
+        """A line on stdout; on one terminal the bars have to make room for it."""
+        if self.bars.disable or not sys.stdout.isatty():
             print(line, flush=True)
         else:
-            console.print(line, markup=False, highlight=False, soft_wrap=True)
-
-    with bar:
-        yield advance, show
+            self.console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def _print_scores(outcomes: "list[Outcome]") -> None:

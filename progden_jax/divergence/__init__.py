@@ -9,11 +9,11 @@ from typing import NamedTuple
 import jax
 from jaxtyping import Array, Float
 
-from progden_jax import _checks
-from progden_jax.divergence._base import Evaluation, Function, Method
+from progden_jax.divergence._base import Evaluation, Function, Method, check_arguments
 from progden_jax.divergence.exact import Exact
 from progden_jax.divergence.monte_carlo import FiniteDifference, MonteCarlo
 from progden_jax.divergence.probing import Probing
+from progden_jax.divergence.running import exact_divergence
 
 __all__ = [
     "DivergenceEstimate",
@@ -27,6 +27,7 @@ __all__ = [
     "divergence",
     "divergence_and_error",
     "evaluate",
+    "exact_divergence",
 ]
 
 
@@ -94,25 +95,13 @@ def evaluate(
     key: jax.Array | None = None,
 ) -> Evaluation:
     """f(x) with its divergence and standard error, the pass through f shared; see `divergence`."""
-    _checks.image("x", x)
-    _checks.same_shape("variance", variance, "x", x)
-    if not callable(f):
-        raise ValueError(
-            f"f is a {type(f).__name__}, expected a function from x to the denoised image."
-        )
     if not hasattr(method, "evaluate"):
         raise ValueError(
             f"method is {method!r}, expected an estimator such as MonteCarlo(probes=4)."
         )
     if key is None:
         key = jax.random.key(0)
-    x, variance = jax.numpy.asarray(x), jax.numpy.asarray(variance)
-    out = jax.eval_shape(f, x)
-    if getattr(out, "shape", None) != x.shape:
-        raise ValueError(
-            f"f gives {getattr(out, 'shape', type(out).__name__)} for x of shape {x.shape}; "
-            "it must give one image of the same shape."
-        )
+    x, variance = check_arguments(f, x, variance)
     run = _evaluate if jax.tree_util.all_leaves([f]) else _compiled
     return run(f, x, variance, key, method)
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from progden_jax import _checks
 from progden_jax._numeric import safe_sqrt
 
 Function = Callable[[Float[Array, "h w 3"]], Float[Array, "h w 3"]]
@@ -24,6 +25,26 @@ class Evaluation(NamedTuple):
     divergence: Float[Array, "h w 3"]
     standard_error: Float[Array, "h w 3"]
     probes: Int[Array, "rows columns"] | None = None
+
+
+def check_arguments(
+    f: Function, x: Float[Array, "h w 3"], variance: Float[Array, "h w 3"]
+) -> tuple[Array, Array]:
+    """x and its variance as JAX arrays; raises ValueError unless f makes one image of another."""
+    _checks.image("x", x)
+    _checks.same_shape("variance", variance, "x", x)
+    if not callable(f):
+        raise ValueError(
+            f"f is a {type(f).__name__}, expected a function from x to the denoised image."
+        )
+    x, variance = jnp.asarray(x), jnp.asarray(variance)
+    out = jax.eval_shape(f, x)
+    if getattr(out, "shape", None) != x.shape:
+        raise ValueError(
+            f"f gives {getattr(out, 'shape', type(out).__name__)} for x of shape {x.shape}; "
+            "it must give one image of the same shape."
+        )
+    return x, variance
 
 
 class Method(Protocol):

@@ -414,7 +414,7 @@ class Sweep:
         batch, _, _, channels = x.shape
         s = window.size
         cells = x.reshape(batch, s, 2, s, 2, channels)
-        codes = self._around(self.kept[index], index, window, 4)
+        codes = self._around(self.kept[index], index, window)
         total = None
         for code in range(4):
             part = self._scale(cells[:, :, code // 2, :, code % 2], codes == code)
@@ -427,10 +427,10 @@ class Sweep:
     ) -> Array:
         """Σ_q w_q dx_q + w_q (x_q − y) dℓ_q over the taps q, w the softmax of the logits ℓ."""
         kept = self.kept[index]
-        wide = Window(window.origin - node.size // 2, window.size + node.size - 1)
-        weights = self._around(kept.weights, index, window, 0)[..., None]
-        around = g.patches(self._around(kept.image, index, wide, 0), node.size)
-        away = weights * (around - self._around(kept.result, index, window, 0)[..., None, :])
+        wide = _filtered(window, node)
+        weights = self._around(kept.weights, index, window)[..., None]
+        around = g.patches(self._around(kept.image, index, wide), node.size)
+        away = weights * (around - self._around(kept.result, index, window)[..., None, :])
         parts = []
         if node.image in values:
             image = self._per_cell(self._read(values, wide, node.image))
@@ -448,20 +448,18 @@ class Sweep:
 
     def _slope(self, index: int, window: Window) -> Array:
         """What the primal pass kept of a pointwise layer, 0 or False beyond the image."""
-        return self._around(self.kept[index], index, window, 0)
+        return self._around(self.kept[index], index, window)
 
-    def _around(self, kept: Array, index: int, window: Window, outside: int) -> Array:
-        """What the primal pass kept, in every cell's window: (cells, s, s, C)."""
+    def _around(self, kept: Array, index: int, window: Window) -> Array:
+        """What the primal pass kept, with its `surround`, in every cell's window: (cells, s, s, C)."""
         level, s = self.plan.levels[index], window.size
-        reach = 2 * s + int(np.abs(window.origin).max())
-        padded = jnp.pad(kept, ((reach, reach), (reach, reach), (0, 0)), constant_values=outside)
         step = self.plan.period >> level
         corner = [
-            (phase >> level) + jnp.asarray(window.origin)[phase] + reach + step * cell
+            (phase >> level) + jnp.asarray(window.origin)[phase] + _margin(window) + step * cell
             for phase, cell in zip(self.phase, self.cells, strict=True)
         ]
         cut = functools.partial(lax.dynamic_slice, slice_sizes=(s, s, kept.shape[-1]))
-        return jax.vmap(lambda row, column: cut(padded, (row, column, 0)))(*corner)
+        return jax.vmap(lambda row, column: cut(kept, (row, column, 0)))(*corner)
 
     def _scale(self, x: Array, slope: Array) -> Array:
         """The tangents of every cell times a slope, or where it is a mask, kept."""
@@ -482,6 +480,43 @@ def _interleave(first: Any, second: Any, axis: int, size: int) -> Array:
     return lax.slice_in_dim(stacked.reshape(shape), 0, size, axis=axis)
 
 
+def _margin(window: Window) -> int:
+    """How far a cell's window can reach beyond the image."""
+    return window.size + int(np.abs(window.origin).max())
+
+
+def surround(plan: Plan, kept: dict[int, Any]) -> dict[int, Any]:
+    """What the primal pass kept, wherever windows are, with a margin that lets no tangent through.
+
+    Made once, not per chunk: at 1080p OIDN's masks are half a GiB.
+    """
+    found = {}
+    for index, arrays in kept.items():
+        window, node = plan.windows[index], plan.nodes[index]
+        if window is None:
+            continue
+        if isinstance(node, g.Filter):
+            found[index] = g.Weighted(
+                _surround(arrays.weights, window, 0),
+                _surround(arrays.image, _filtered(window, node), 0),
+                _surround(arrays.result, window, 0),
+            )
+        else:
+            # A pooling's codes are 0 to 3: with 4 none of four has won.
+            found[index] = _surround(arrays, window, 4 if isinstance(node, g.MaxPool) else 0)
+    return found
+
+
+def _surround(array: Array, window: Window, outside: int) -> Array:
+    widths = [(_margin(window), _margin(window))] * 2 + [(0, 0)]
+    return jnp.pad(array, widths, constant_values=outside)
+
+
+def _filtered(window: Window, node: g.Filter) -> Window:
+    """The pixels whose values a filter's window reads."""
+    return Window(window.origin - node.size // 2, window.size + node.size - 1)
+
+
 def jacobian_diagonal(
     plan: Plan,
     params: Any,
@@ -491,51 +526,59 @@ def jacobian_diagonal(
     chunk: int,
     precision: Any,
 ) -> Float[Array, "h w 3"]:
-    """∂output_pc/∂input_pc of a network at every pixel and channel, (H, W, 3), over all phases."""
-    period = plan.period
+    """∂output_pc/∂input_pc of a network at every pixel and channel, (H, W, 3), over all phases.
+
+    `kept` is what `graph.evaluate` gives.
+    """
+    kept = surround(plan, kept)
+    count = cells_per_phase(plan, size)
     rows = lax.map(
-        lambda index: phase_diagonal(
-            plan, params, kept, size, index, chunk=chunk, precision=precision
+        lambda phase: some_cells(
+            plan, params, kept, size, phase, 0, count, chunk=chunk, precision=precision
         ),
-        jnp.arange(period * period),
+        jnp.arange(plan.period**2),
     )
-    return assemble(rows, size, period)
+    return assemble(rows, size, plan.period)
 
 
-def assemble(rows: Array, size: tuple[int, int], period: int) -> Float[Array, "h w 3"]:
-    """The image from its phases, (period², H/period, W/period, 3)."""
+def assemble(rows: Any, size: tuple[int, int], period: int) -> Any:
+    """The image (H, W, 3) from its phases' cells, (period², cells, 3), of JAX or NumPy."""
     height, width = size
     split = rows.reshape(period, period, height // period, width // period, 3)
     return split.transpose(2, 0, 3, 1, 4).reshape(height, width, 3)
 
 
-def phase_diagonal(
+def cells_per_phase(plan: Plan, size: tuple[int, int]) -> int:
+    """Pixels of each phase in a padded image of this size."""
+    return (size[0] // plan.period) * (size[1] // plan.period)
+
+
+def some_cells(
     plan: Plan,
     params: Any,
-    kept: dict[int, Any],
+    surrounded: dict[int, Any],
     size: tuple[int, int],
-    index: Array,
+    phase: Array,
+    first: Array | int,
+    number: int,
     *,
     chunk: int,
     precision: Any,
-) -> Float[Array, "h w 3"]:
-    """The diagonal at the pixels of one phase, (H/period, W/period, 3), `chunk` of them at once."""
-    period = plan.period
-    across = size[1] // period
-    count = (size[0] // period) * across
-    chunk = min(chunk, count)
-    phase = (index // period, index % period)
+) -> Float[Array, "cells 3"]:
+    """The diagonal at `number` pixels of a phase from the `first` on, `chunk` of them at once.
 
-    def some(first: Array) -> Array:
-        # The last chunk reaches back over cells already done instead of past the end.
-        cells = jnp.minimum(first, count - chunk) + jnp.arange(chunk)
-        sweep = Sweep(plan, params, kept, phase, (cells // across, cells % across), precision)
+    `phase` and `first` may be traced. Beyond the last pixel of the phase the last one is repeated.
+    """
+    period = plan.period
+    across, last = size[1] // period, cells_per_phase(plan, size) - 1
+    chunk = min(chunk, number)
+    place = (phase // period, phase % period)
+
+    def some(start: Array) -> Array:
+        cells = jnp.minimum(start + jnp.arange(chunk), last)
+        split = (cells // across, cells % across)
+        sweep = Sweep(plan, params, surrounded, place, split, precision)
         return jnp.diagonal(sweep.run(), axis1=1, axis2=2)
 
-    starts = jnp.arange(0, count, chunk)
-    found = lax.map(some, starts)
-    whole = count // chunk * chunk
-    flat = found[: count // chunk].reshape(whole, 3)
-    if whole < count:
-        flat = jnp.concatenate([flat, found[-1][chunk - (count - whole) :]])
-    return flat.reshape(size[0] // period, across, 3)
+    found = lax.map(some, first + jnp.arange(0, number, chunk))
+    return found.reshape(-1, 3)[:number]

@@ -1,5 +1,6 @@
 """The exact divergence: by unit vectors, by colouring, and by cones."""
 
+import contextlib
 import dataclasses
 import logging
 from typing import Any
@@ -12,7 +13,7 @@ from jaxtyping import Array, Float
 
 from progden_jax import _checks
 from progden_jax.denoisers import graph
-from progden_jax.divergence import cone
+from progden_jax.divergence import _reach, cone
 from progden_jax.divergence._base import Evaluation, Function
 
 ALGORITHMS = ("auto", "basis", "coloring", "cone")
@@ -20,24 +21,40 @@ ALGORITHMS = ("auto", "basis", "coloring", "cone")
 logger = logging.getLogger(__name__)
 
 
+COLORS_AT_ONCE = 4
+
+
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Exact:
     """σ²·∂f/∂x without error but rounding; the key is not used and the standard error is 0.
 
+    Where it takes minutes, `exact_divergence` shows progress and can be interrupted and resumed.
+
     Parameters
     ----------
     algorithm :
         "basis": one tangent per pixel and channel, 3HW in all; any f.
-        "coloring": pixels further apart than f reaches share a tangent: 3(R + 1)² of them, more where
-            pooling aligns f to blocks; any f whose `reach` is given or known.
+        "coloring": pixels further apart than f reaches share a tangent: 3(R + 1)² of them. How far that is is
+            found from f's jaxpr, along rows and columns apart, at x's size; strides, pooling,
+            upsampling and all that does not depend on x are followed. Where it cannot be found, an error
+            names the primitive that hinders it: give `reach`, or use "basis".
         "cone": through windows of a few pixels in a network whose layers f shows (`f.layered`, as OIDN's
             do): about 400 forward passes for OIDN's base network, at any size.
         "auto": the cheapest of those that apply; `cost` says what each would take.
     reach : (radius, alignment) in pixels for "coloring": f(x)_q depends on x_p only within `radius`, in a way
-        that repeats every `alignment` pixels. None: as f says of itself.
+        that repeats every `alignment` pixels. None: as f says of itself (`f.receptive_radius`), or found.
     chunk : tangents at once ("basis", "coloring") or pixels at once ("cone"); memory grows with it.
         None: as many as make efficient products.
+
+    Notes
+    -----
+    Reverse-mode gradients in f's parameters keep the residuals of every tangent: memory grows with the cost
+    in passes, so train on small crops. Through ReLUs and max pooling J is piecewise constant in x: the
+    gradient in x has only what smooth parts (transfer functions) give. The reach comes
+    from an analysis of our own, for that of the asdex library (0.5) lists every entry of the Jacobian
+    (10 s for three layers at 64×64), lacks reduce_window and colours for the whole Jacobian (147
+    colours where the diagonal takes 48).
     """
 
     algorithm: str = "auto"
@@ -61,20 +78,23 @@ class Exact:
         key: jax.Array,
     ) -> Evaluation:
         del key
-        algorithm = self.algorithm
-        if algorithm == "auto":
-            costs = self.cost(f, x)
-            algorithm = min(costs, key=lambda name: costs[name])
-            logger.info("exact divergence by %s; costs in forward passes: %s", algorithm, costs)
+        algorithm = self.choose(f, x)
         if algorithm == "cone":
             value, diagonal = self._by_cone(f, x)
         else:
             value, tangent = jax.linearize(f, x)
-            colors = np.arange(x.size).reshape(x.shape)
-            if algorithm == "coloring":
-                colors = _coloring(self._period(f), x.shape)
-            diagonal = _diagonal_by_colors(tangent, colors, x, self.chunk or 4)
+            colors = self.colors(f, x, algorithm)
+            diagonal = _diagonal_by_colors(tangent, colors, x, self.chunk or COLORS_AT_ONCE)
         return Evaluation(value, variance * diagonal, jnp.zeros_like(value))
+
+    def choose(self, f: Function, x: Float[Array, "h w 3"]) -> str:
+        """The algorithm itself, or in place of "auto" the cheapest."""
+        if self.algorithm != "auto":
+            return self.algorithm
+        costs = self.cost(f, x)
+        algorithm = min(costs, key=lambda name: costs[name])
+        logger.info("exact divergence by %s; costs in forward passes: %s", algorithm, costs)
+        return algorithm
 
     def cost(self, f: Function, x: Float[Array, "h w 3"]) -> dict[str, float]:
         """What each algorithm that applies to f would take at x's size, in forward passes of f.
@@ -82,74 +102,102 @@ class Exact:
         A tangent pass counts as one. "cone" counts multiply-adds of its products against the network's.
         """
         costs = {"basis": float(x.size)}
-        if self.reach is not None or hasattr(f, "receptive_radius"):
-            costs["coloring"] = float(_coloring(self._period(f), x.shape).max() + 1)
+        with contextlib.suppress(_reach.UnknownReachError):
+            costs["coloring"] = float(self.colors(f, x, "coloring").max() + 1)
         if hasattr(f, "layered"):
             nodes, params = f.layers  # pyright: ignore[reportFunctionMemberAccess]
             plan = cone.plan(nodes, params)
             costs["cone"] = cone.multiply_adds(plan, params) / graph.multiply_adds(nodes, params)
         return costs
 
-    def _period(self, f: Function) -> int:
-        """Pixels apart that two share no output: the least multiple of the alignment beyond the reach."""
+    def colors(self, f: Function, x: Float[Array, "h w 3"], algorithm: str) -> np.ndarray:
+        """Colours (H, W, 3) from 0 up: those of one colour share a tangent."""
+        if algorithm == "basis":
+            return np.arange(x.size).reshape(x.shape)
+        return _coloring(self._periods(f, x), x.shape)
+
+    def _periods(self, f: Function, x: Array) -> tuple[int, int]:
+        """Rows and columns apart that two pixels share no output."""
         if self.reach is not None:
             radius, alignment = self.reach
         elif hasattr(f, "receptive_radius"):
             radius, alignment = f.receptive_radius, f.alignment  # pyright: ignore[reportFunctionMemberAccess]
         else:
-            raise ValueError(
-                "algorithm is 'coloring' and nothing is known of how far f reaches: give "
-                "Exact('coloring', reach=(radius, alignment)) in pixels, or use algorithm='basis'."
-            )
-        return -(-(radius + 1) // alignment) * alignment
+            try:
+                rows, columns = _reach.radii(f, x)
+            except _reach.UnknownReachError as error:
+                raise _reach.UnknownReachError(
+                    f"algorithm is 'coloring', and how far f reaches cannot be found: {error}. Give "
+                    "Exact('coloring', reach=(radius, alignment)) in pixels, or use algorithm='basis'."
+                ) from None
+            return rows + 1, columns + 1
+        period = -(-(radius + 1) // alignment) * alignment
+        return period, period
 
     def _by_cone(self, f: Function, x: Array) -> tuple[Array, Array]:
-        if not hasattr(f, "layered"):
-            raise ValueError(
-                f"algorithm is 'cone', which looks inside the network, and f, a {type(f).__name__}, does "
-                "not show its layers: bind one of progden_jax's denoisers, give f `layers` and `layered` "
-                "(see progden_jax.denoisers.graph), or use algorithm='basis' or 'coloring'."
-            )
+        check_layered(f)
         layered: graph.Layered = f.layered(x)  # pyright: ignore[reportFunctionMemberAccess]
-        height, width = x.shape[:2]
-        output, kept = graph.evaluate(
-            layered.nodes, layered.params, layered.inputs, inside=layered.inside
-        )
-        plan = cone.plan(layered.nodes, layered.params)
+        value, slope, kept = cone_primal(layered, x)
         diagonal = cone.jacobian_diagonal(
-            plan,
+            cone.plan(layered.nodes, layered.params),
             layered.params,
             kept,
             (layered.inputs.shape[0], layered.inputs.shape[1]),
-            # Windows of 32 pixels stay in a core's cache; a GPU wants more to do at once.
-            chunk=self.chunk or (32 if jax.default_backend() == "cpu" else 1024),
+            chunk=self.chunk or cone_chunk(),
             precision=lax.Precision.HIGHEST,
         )
-        inner = output[:height, :width]
-        value, slope = jax.jvp(layered.decode, (inner,), (jnp.ones_like(inner),))
-        return value, slope * diagonal[:height, :width] * layered.encode_slope
+        return value, slope * diagonal[: x.shape[0], : x.shape[1]]
 
 
-def _coloring(period: int, shape: tuple[int, ...]) -> np.ndarray:
-    """Colours (H, W, 3) from 0 up, such that equal ones are `period` pixels apart in a row or column."""
-    height, width, channels = shape
-    rows, columns = (np.arange(n) % min(period, n) for n in (height, width))
+def check_layered(f: Function) -> None:
+    """Raise unless f shows its layers."""
+    if not hasattr(f, "layered"):
+        raise ValueError(
+            f"algorithm is 'cone', which looks inside the network, and f, a {type(f).__name__}, does "
+            "not show its layers: bind one of progden_jax's denoisers, give f `layers` and `layered` "
+            "(see progden_jax.denoisers.graph), or use algorithm='basis' or 'coloring'."
+        )
+
+
+def cone_chunk() -> int:
+    """Windows of 32 pixels stay in a core's cache; a GPU wants more to do at once."""
+    return 32 if jax.default_backend() == "cpu" else 1024
+
+
+def cone_primal(layered: graph.Layered, x: Array) -> tuple[Array, Array, dict[int, Array]]:
+    """f(x), what the network's diagonal is to be multiplied by, and what the sweeps need."""
+    output, kept = graph.evaluate(
+        layered.nodes, layered.params, layered.inputs, inside=layered.inside
+    )
+    inner = output[: x.shape[0], : x.shape[1]]
+    value, slope = jax.jvp(layered.decode, (inner,), (jnp.ones_like(inner),))
+    return value, slope * layered.encode_slope, kept
+
+
+def _coloring(periods: tuple[int, int], shape: tuple[int, ...]) -> np.ndarray:
+    """Colours such that equal ones are a period or more apart in a row or column."""
+    rows, columns = (np.arange(n) % p for n, p in zip(shape[:2], periods, strict=True))
     color = rows[:, None] * (columns.max() + 1) + columns[None, :]
-    return color[..., None] * channels + np.arange(channels)
+    return color[..., None] * shape[2] + np.arange(shape[2])
+
+
+def some_colors(tangent: Any, painted: Array, numbers: Array, dtype: Any) -> Array:
+    """Σ over colours k of 1_k ⊙ J 1_k."""
+
+    def one(number: Array) -> Array:
+        lit = painted == number
+        return jnp.where(lit, tangent(lit.astype(dtype)), 0)
+
+    return jax.vmap(one)(numbers).sum(0)
 
 
 def _diagonal_by_colors(tangent: Any, colors: np.ndarray, x: Array, chunk: int) -> Array:
-    """Σ over colours k of (1_k ⊙ J 1_k)."""
     count = int(colors.max()) + 1
-    painted = jnp.asarray(colors)
-
-    def add(total: Array, indices: Array) -> tuple[Array, None]:
-        def one(index: Array) -> Array:
-            lit = painted == index
-            return jnp.where(lit, tangent(lit.astype(x.dtype)), 0)
-
-        return total + jax.vmap(one)(indices).sum(0), None
-
     chunk = min(chunk, count)
-    padded = jnp.arange(-(-count // chunk) * chunk).reshape(-1, chunk)
-    return lax.scan(add, jnp.zeros_like(x), padded)[0]
+    painted = jnp.asarray(colors)
+    numbers = jnp.arange(-(-count // chunk) * chunk).reshape(-1, chunk)
+
+    def add(total: Array, some: Array) -> tuple[Array, None]:
+        return total + some_colors(tangent, painted, some, x.dtype), None
+
+    return lax.scan(add, jnp.zeros_like(x), numbers)[0]
