@@ -28,6 +28,9 @@ __all__ = [
     "write_tza",
 ]
 
+PRECISIONS = ("highest", "high", "default", "tensorfloat32", "bfloat16")
+"""Of the convolutions; see `OIDN`."""
+
 QUALITIES = ("fast", "balanced", "high")
 """OIDN's small, base and large weights."""
 
@@ -63,7 +66,7 @@ def load(
     """
     if exposure is not None and not exposure > 0:
         raise ValueError(f"exposure is {exposure}, expected a number above 0.")
-    _checks.choice("precision", precision, ("highest", "high", "default", "tensorfloat32"))
+    _checks.choice("precision", precision, PRECISIONS)
     if str(name).endswith(".tza"):
         params = unet.from_tensors(read_tza(name))
         if inputs is None:

@@ -14,6 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from progden_jax._numeric import own_zero
 from progden_jax.denoisers.graph import Conv, Input, MaxPool, Node, Relu, Upsample
 
 Params = Mapping[str, Mapping[str, Any]]
@@ -84,25 +85,29 @@ def apply(
     inputs : (H, W, C) transferred colour and auxiliary channels; H and W multiples of 16.
     valid : (height, width), multiples of 16, at most (H, W), may be traced: what lies outside counts as the
         zero padding around an image of this size, so that one compiled program serves many sizes.
-    precision : of the convolutions. The default keeps float32 on GPUs, where JAX else takes TF32.
+    precision : of the convolutions. The default keeps float32 on GPUs, where JAX else takes TF32. "bfloat16"
+        rounds their inputs and kernels to bfloat16 and sums in float32, tangents likewise.
     """
     encoder, bottom, decoder = layout(params)
+    narrow = precision == "bfloat16"
     masks = [_mask(inputs.shape[0] >> n, inputs.shape[1] >> n, valid, n) for n in range(LEVELS + 1)]
 
     def convolve(name: str, x: Array, level: int) -> Array:
+        kernel = jnp.asarray(params[name]["kernel"])
         x = lax.conv_general_dilated(
-            x[None],
-            params[name]["kernel"],
+            x[None].astype(jnp.bfloat16) if narrow else x[None],
+            kernel.astype(jnp.bfloat16) if narrow else kernel,
             (1, 1),
             "SAME",
             dimension_numbers=("NHWC", "HWIO", "NHWC"),
-            precision=precision,
+            precision=None if narrow else precision,
+            preferred_element_type=x.dtype if narrow else None,
         )[0]
         x = x + params[name]["bias"]
         positive = x > 0
         if (mask := masks[level]) is not None:
             positive &= mask
-        return jnp.where(positive, x, 0)
+        return jnp.where(positive, x, own_zero(x))
 
     x, skips = inputs, [inputs]
     for level, names in enumerate(encoder):
