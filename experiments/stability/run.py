@@ -10,6 +10,7 @@ were not tampered with, by unit vectors: there chance is included.
 
 import argparse
 import csv
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,9 +27,10 @@ from progden_jax.divergence import _random
 HERE = Path(__file__).parent
 EPSILONS = tuple(float(f"{10**e:.2g}") for e in np.arange(-6, -0.9, 0.5))
 SCALES = tuple(10.0**e for e in range(-6, 7, 2))
+NETWORKS = ("float32", "TF32", "bfloat16")
 SPP = (8, 128)
 PROBES = 4
-SAMPLED = 64
+SAMPLED = 32
 FIREFLY = 1e6
 INPUTS = ("as rendered", "zero variances", "fireflies", "repaired infinities")
 HEADER = (
@@ -77,58 +79,57 @@ def tampered(frame: pd.Frame, how: str) -> tuple[pd.Frame, np.ndarray]:
     return frame, np.ones_like(few)
 
 
-def cases(frame: pd.Frame, load: Any, scales: tuple[float, ...]) -> Iterator[Case]:
+def cases(frame: pd.Frame, denoiser: Any, scales: tuple[float, ...]) -> Iterator[Case]:
     """Every input made of one crop; the first is the crop itself."""
     assert frame.variance is not None
-    automatic, everything = load(), np.ones(frame.size, bool)
+    everything = np.ones(frame.size, bool)
     for how in INPUTS:
         changed, untouched = tampered(frame, how)
-        yield Case("inputs", how, "automatic", changed, automatic.bind(changed), untouched)
-    fixed = load(exposure=float(automatic.bind(frame).exposure))
+        yield Case("inputs", how, "automatic", changed, denoiser.bind(changed), untouched)
+    fixed = denoiser.bind(frame).exposure
     for scale in scales:
         scaled = pd.Frame(frame.color * scale, frame.variance * scale**2)
-        for name, denoiser in (("automatic", automatic), ("fixed", fixed)):
-            yield Case("scale", f"{scale:g}", name, scaled, denoiser.bind(scaled), everything)
+        f = denoiser.bind(scaled)
+        yield Case("scale", f"{scale:g}", "automatic", scaled, f, everything)
+        f = dataclasses.replace(f, exposure=fixed)
+        yield Case("scale", f"{scale:g}", "fixed", scaled, f, everything)
 
 
-def float64_truths(case: Case) -> dict[str, np.ndarray]:
-    """The same estimates in float64 by the name of their probes, and "exact" at `sampled` values."""
+def float64_truths(case: Case, found: dict[str, pd.Method]) -> dict[str, np.ndarray]:
+    """The same estimates in float64, by method; "image" is f(x), "exact" the truth at `sampled` values."""
     frame = case.frame
     assert frame.variance is not None
     sigma = np.sqrt(np.asarray(frame.variance, np.float64))
-    drawn = [np.asarray(_random.normal(KEY, k, frame.color)) for k in range(PROBES)]
+    probes = sigma * [np.asarray(_random.normal(KEY, k, frame.color)) for k in range(PROBES)]
     index = sampled(case)
     with jax.enable_x64(True):
         f, x, variance = jax.tree.map(
             lambda a: jnp.asarray(np.asarray(a), jnp.float64), (case.f, frame.color, frame.variance)
         )
-        products = _tangents(f, x, jnp.asarray([sigma * b for b in drawn]))
+        image, products, diagonal = _linearized(f, x, jnp.asarray(probes), jnp.asarray(index))
         truths = {
-            "gaussian": np.mean([sigma * b * p for b, p in zip(drawn, products, strict=True)], 0)
+            "image": np.asarray(image),
+            "gaussian": np.mean(probes * np.asarray(products), 0),
+            "exact": np.asarray(diagonal * variance.ravel()[index]),
         }
-        for name, method in methods().items():
-            if not isinstance(method, pd.FiniteDifference) and name != "MonteCarlo, gaussian":
+        for name, method in found.items():
+            if not (is_gaussian(name) or isinstance(method, pd.Exact)):
                 estimate = pd.divergence(f, x, variance, method=method, key=KEY)
                 truths[name] = np.asarray(estimate)
-        truths["image"] = np.asarray(f(x))
-        truths["exact"] = np.asarray(_diagonal(f, x, jnp.asarray(index)) * variance.ravel()[index])
     return truths
 
 
 @jax.jit
-def _tangents(f: Any, x: jax.Array, vectors: jax.Array) -> jax.Array:
-    _, tangent = jax.linearize(f, x)
-    return jax.lax.map(tangent, vectors)
-
-
-@jax.jit
-def _diagonal(f: Any, x: jax.Array, index: jax.Array) -> jax.Array:
-    _, tangent = jax.linearize(f, x)
+def _linearized(
+    f: Any, x: jax.Array, vectors: jax.Array, index: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """f(x), J v for each vector, and the Jacobian's diagonal at flat indices."""
+    value, tangent = jax.linearize(f, x)
 
     def one(i: jax.Array) -> jax.Array:
         return tangent(jnp.zeros(x.size, x.dtype).at[i].set(1).reshape(x.shape)).ravel()[i]
 
-    return jax.lax.map(one, index)
+    return value, jax.lax.map(tangent, vectors), jax.lax.map(one, index)
 
 
 def sampled(case: Case) -> np.ndarray:
@@ -141,16 +142,22 @@ def sampled(case: Case) -> np.ndarray:
     return np.concatenate((largest, rest[: SAMPLED - len(largest)]))
 
 
-def methods(epsilon: float = 1e-4) -> dict[str, pd.Method]:
+def methods() -> dict[str, pd.Method]:
     """The estimators compared, by name."""
     return {
-        "FiniteDifference": pd.FiniteDifference(probes=PROBES, epsilon=epsilon),
+        "FiniteDifference": pd.FiniteDifference(probes=PROBES),
         "MonteCarlo, gaussian": pd.MonteCarlo(probes=PROBES, distribution="gaussian"),
         "MonteCarlo": pd.MonteCarlo(probes=PROBES),
         "Probing": pd.Probing(probes=PROBES),
         "Probing, sigma": pd.Probing(probes=PROBES, scale="sigma"),
         "Probing, unit": pd.Probing(probes=PROBES, scale="unit"),
+        "Exact": pd.Exact("cone"),
     }
+
+
+def is_gaussian(name: str) -> bool:
+    """Whether the method's probes are the Gaussian vectors, which float64 would draw anew."""
+    return name in ("FiniteDifference", "MonteCarlo, gaussian")
 
 
 def relative(estimate: np.ndarray, truth: np.ndarray) -> float:
@@ -162,68 +169,85 @@ def relative(estimate: np.ndarray, truth: np.ndarray) -> float:
     return float(np.sqrt(square.mean() / ((truth / scale) ** 2).mean()))
 
 
+@jax.jit
+def differences(f: Any, x: jax.Array, variance: jax.Array, epsilon: jax.Array) -> jax.Array:
+    """`pd.FiniteDifference` with a step that is traced, so that all steps share one program."""
+    method = pd.FiniteDifference(probes=PROBES)
+    object.__setattr__(method, "epsilon", epsilon)
+    return method.evaluate(f, x, variance, KEY).divergence
+
+
 def compare(
-    case: Case, network: str, name: str, method: pd.Method, truths: dict[str, np.ndarray]
+    case: Case,
+    network: str,
+    name: str,
+    method: pd.Method | float,
+    truths: dict[str, np.ndarray],
 ) -> tuple:
-    """The last six columns of one row: one method in one precision on one input."""
+    """The last six columns of one row: a method, or a step of differences, in one precision on one input."""
     frame = case.frame
     assert frame.variance is not None
     f = rounding.tf32(case.f) if network == "TF32" else case.f
-    estimate = pd.divergence(f, frame.color, frame.variance, method=method, key=KEY)
+    if isinstance(method, float):
+        estimate = differences(f, frame.color, frame.variance, jnp.float32(method))
+    else:
+        estimate = pd.divergence(f, frame.color, frame.variance, method=method, key=KEY)
     estimate = np.asarray(estimate)
     sample = estimate.ravel()[sampled(case)]
     total = relative(sample, truths["exact"])
-    gaussian = isinstance(method, pd.FiniteDifference) or name == "MonteCarlo, gaussian"
     if isinstance(method, pd.Exact):
         numerical = elsewhere = total
     else:
-        truth = truths["gaussian" if gaussian else name]
+        truth = truths["gaussian" if is_gaussian(name) else name]
         numerical = relative(estimate, truth)
         elsewhere = relative(estimate[case.untouched], truth[case.untouched])
     return network, name, numerical, elsewhere, total, bool(np.isfinite(estimate).all())
 
 
 def measure(
-    frame: pd.Frame, name: str, epsilons: tuple[float, ...], scales: tuple[float, ...], exact: bool
+    frame: pd.Frame,
+    name: str,
+    chosen: dict[str, pd.Method],
+    *,
+    networks: tuple[str, ...],
+    epsilons: tuple[float, ...],
+    scales: tuple[float, ...],
 ) -> Iterator[tuple]:
     """Rows without scene and spp."""
     coarse = pd.denoisers.load(name, precision="bfloat16")
-    for case in cases(frame, lambda **k: pd.denoisers.load(name, **k), scales):
-        truths = float64_truths(case)
+    for case in cases(frame, pd.denoisers.load(name), scales):
+        truths = float64_truths(case, chosen)
         label = (case.study, case.setting, case.exposure)
-        found = methods() | ({"Exact": pd.Exact("cone")} if exact else {})
-        for method_name, method in found.items():
+        for method_name, method in chosen.items():
             yield *label, *compare(case, "float32", method_name, method, truths)
         if case.setting != INPUTS[0]:
             continue
-        exposed = type(coarse)(
-            coarse.params, exposure=float(case.f.exposure), precision="bfloat16"
-        ).bind(frame)
-        for network in ("float32", "TF32", "bfloat16"):
-            used = case._replace(f=exposed) if network == "bfloat16" else case
-            for method_name, method in list(methods().items())[1:]:
-                row = compare(used, network, method_name, method, truths)
-                yield "precision", network, case.exposure, *row
-            image = np.asarray(
-                (rounding.tf32(used.f) if network == "TF32" else used.f)(frame.color)
-            )
+        for network in networks:
+            used = case._replace(f=coarse.bind(frame)) if network == "bfloat16" else case
+            for method_name, method in chosen.items():
+                if method_name not in ("FiniteDifference", "Exact"):
+                    row = compare(used, network, method_name, method, truths)
+                    yield "precision", network, case.exposure, *row
+            for epsilon in epsilons:
+                row = compare(used, network, "FiniteDifference", epsilon, truths)
+                yield "epsilon", f"{epsilon:g}", case.exposure, *row
+            f = rounding.tf32(used.f) if network == "TF32" else used.f
+            image = np.asarray(f(frame.color))
             error = relative(image, truths["image"])
             yield (
                 *("precision", network, case.exposure, network, "the image itself"),
                 *(error, error, error, bool(np.isfinite(image).all())),
             )
-            for epsilon in epsilons:
-                difference = methods(epsilon)["FiniteDifference"]
-                row = compare(used, network, "FiniteDifference", difference, truths)
-                yield "epsilon", f"{epsilon:g}", case.exposure, *row
 
 
 def main() -> None:
     parser = _common.parser(__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("--spp", type=int, nargs="*", default=SPP)
-    parser.add_argument("--size", type=int, default=64, help="edge of the crop in pixels")
+    parser.add_argument("--size", type=int, default=48, help="edge of the crop in pixels")
     parser.add_argument("--denoiser", default="oidn-hdr")
+    parser.add_argument("--networks", nargs="*", choices=NETWORKS, default=NETWORKS)
+    parser.add_argument("--methods", nargs="*", choices=methods(), default=tuple(methods()))
     parser.add_argument("--epsilons", type=float, nargs="*", default=EPSILONS)
     parser.add_argument("--scales", type=float, nargs="*", default=SCALES)
     parser.add_argument("--exact", type=int, default=2, help="frames on which Exact is run as well")
@@ -238,13 +262,17 @@ def main() -> None:
         frames = _common.series(arguments.data, names, arguments.spp)
         for number, (scene, spp, frame, _) in enumerate(frames):
             small = crop(frame, arguments.size)
-            exact = number < arguments.exact
             for row in measure(
                 small,
                 arguments.denoiser,
-                tuple(arguments.epsilons),
-                tuple(arguments.scales),
-                exact,
+                {
+                    name: method
+                    for name, method in methods().items()
+                    if name in arguments.methods and (name != "Exact" or number < arguments.exact)
+                },
+                networks=tuple(arguments.networks),
+                epsilons=tuple(arguments.epsilons),
+                scales=tuple(arguments.scales),
             ):
                 rows.append((*row[:3], scene, spp, *row[3:]))
                 writer.writerow(rows[-1])
