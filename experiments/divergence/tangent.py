@@ -2,8 +2,9 @@
 
     python -m experiments.divergence.tangent [--size 256 512] [--native-level 8]
 
-One run measures all programs in turn, again and again, and takes each one's least time, so that ratios
-survive a busy machine. "per tangent" is what a probe adds beyond the first.
+One run measures all programs in turn, again and again, and takes each one's least time. Processor time,
+summed over threads, hardly depends on who else uses the machine; the clock does. "per tangent" is what a
+probe adds beyond the first.
 """
 
 import argparse
@@ -11,7 +12,7 @@ import importlib.util
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -68,19 +69,27 @@ def native_filter(color: np.ndarray, level: int | None) -> tuple[Callable[[], An
     return chain.execute, output
 
 
+class Seconds(NamedTuple):
+    """Least time of a program by the clock and summed over its threads."""
+
+    clock: float
+    processor: float
+
+
 def least_seconds(
     programs: dict[str, Callable[[], Any]], rounds: int, budget: float
-) -> dict[str, float]:
+) -> dict[str, Seconds]:
     """Each program's least time over rounds in which all take turns, until the seconds are spent."""
-    least = dict.fromkeys(programs, float("inf"))
+    least = dict.fromkeys(programs, Seconds(float("inf"), float("inf")))
     end = time.perf_counter() + budget
     for done in range(rounds):
         if done and time.perf_counter() > end:
             break
         for name, run in programs.items():
-            start = time.perf_counter()
+            clock, processor = time.perf_counter(), time.process_time()
             jax.block_until_ready(run())
-            least[name] = min(least[name], time.perf_counter() - start)
+            taken = Seconds(time.perf_counter() - clock, time.process_time() - processor)
+            least[name] = Seconds(*map(min, least[name], taken))
     return least
 
 
@@ -109,18 +118,20 @@ def measure(denoiser: Any, size: int, rounds: int, budget: float, level: int | N
     for name, seconds in least.items():
         _, probes = METHODS.get(name, (None, 0))
         memory: Any = compiled[name].memory_analysis() if name in compiled else None
+        more = (seconds.processor - one.processor) / once.processor
         notes = {
-            "forward": f"{analysis['flops'] / once / 1e9:.0f} GFLOP/s",
+            "forward": f"{analysis['flops'] / once.clock / 1e9:.0f} GFLOP/s",
             "native OIDN": f"relative RMSE to ours {off:.1e}",
         }
         rows.append(
             (
                 f"{size}×{size}",
                 name,
-                1e3 * seconds,
-                seconds / once,
+                1e3 * seconds.clock,
+                seconds.clock / once.clock,
+                seconds.processor / once.processor,
                 1 + TARGET * probes if probes else "",
-                (seconds - one) / (probes - 1) / once if probes > 1 else "",
+                more / (probes - 1) if probes > 1 else "",
                 memory.temp_size_in_bytes / 1e6 if memory else "",
                 notes.get(name, ""),
             )
@@ -146,7 +157,10 @@ def main() -> None:
     rows = []
     for size in arguments.size:
         rows += measure(denoiser, size, arguments.rounds, arguments.budget, arguments.native_level)
-    columns = ("size", "program", "ms", "forwards", "target", "per tangent", "temporaries, MB", "")
+    columns = (
+        *("size", "program", "ms", "forwards by the clock", "by processor time", "target"),
+        *("per tangent", "temporaries, MB", ""),
+    )
     print(f"\n{arguments.denoiser}\n")
     print(_common.markdown(columns, rows))
 
