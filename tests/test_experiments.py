@@ -1,11 +1,13 @@
 """Every experiment's command runs to its end on the bundled series."""
 
+import csv
 import sys
 
 import pytest
 from conftest import DEMO
 
 from experiments.main_job import run as main_job
+from experiments.stability import run as stability
 
 
 def test_main_job(monkeypatch, capsys):
@@ -21,3 +23,34 @@ def test_main_job_without_data(monkeypatch, tmp_path):
     monkeypatch.setattr(sys, "argv", ["run", "--data", str(tmp_path)])
     with pytest.raises(SystemExit, match="give --data FOLDER"):
         main_job.main()
+
+
+def test_stability(monkeypatch, tmp_path):
+    """One small crop: derivatives keep float32's digits on every input, differences on none."""
+    options = {
+        "--data": DEMO,
+        "--spp": 8,
+        "--size": 16,
+        "--denoiser": "oidn-hdr-small",
+        "--networks": "float32",
+        "--epsilons": 1e-4,
+        "--scales": 1e-6,
+        "--output": tmp_path / "found.csv",
+    }
+    command = [str(word) for option in options.items() for word in option]
+    chosen = ["--methods", "FiniteDifference", "MonteCarlo, gaussian"]
+    monkeypatch.setattr(sys, "argv", ["run", *command, *chosen])
+    monkeypatch.setattr(stability.pd, "enable_compilation_cache", lambda: None)
+    stability.main()
+    with (tmp_path / "found.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["study"] for row in rows} == {"inputs", "precision", "epsilon", "scale"}
+    assert {row["finite"] for row in rows} == {"True"}
+    for row in rows:
+        error = float(row["elsewhere"])
+        if row["method"] == "FiniteDifference":
+            assert 1e-3 < error < (1 if row["exposure"] == "automatic" else 10)
+        else:
+            assert 0 < error < 1e-4
+    assert (tmp_path / "found.png").stat().st_size > 10_000
+    assert "| epsilon | 0.0001 |" in (tmp_path / "found.md").read_text()

@@ -23,7 +23,7 @@ Params = Mapping[str, Mapping[str, Any]]
 Valid = tuple[Array | int, Array | int] | None
 """The true (height, width), may be traced, of images padded beyond it; None: all is true."""
 
-PRECISIONS = ("highest", "high", "default", "tensorfloat32")
+PRECISIONS = ("highest", "high", "default", "tensorfloat32", "bfloat16")
 
 
 class Network:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from progden_jax._numeric import own_zero
 from progden_jax.denoisers.nodes import (
     Add,
     Affine,
@@ -192,6 +193,8 @@ def evaluate(
     image's extent, (h, w, 1), for each `Conv` that nothing read from it bounds to that.
 
     `inside` (H, W, 1) is False where the input is padding around the image that a traced size leaves.
+    `precision` is that of the convolutions: JAX's, or "bfloat16", which rounds their inputs and kernels to
+    that and sums in float32, tangents likewise.
     """
     strides = levels(nodes)
     masks = _mask_pyramid(inside, max(strides))
@@ -218,7 +221,7 @@ def evaluate(
                 if masks is not None:
                     passes &= masks[level]
                 kept[index] = passes
-                value = jnp.where(passes, values[node.source], 0)
+                value = jnp.where(passes, values[node.source], own_zero(values[node.source]))
             case LeakyRelu():
                 x = values[node.source]
                 kept[index] = x > 0
@@ -248,13 +251,15 @@ def evaluate(
 
 
 def _convolve(layer: Any, x: Array, precision: Any) -> Array:
+    kernel, narrow = jnp.asarray(layer["kernel"]), precision == "bfloat16"
     value = lax.conv_general_dilated(
-        x[None],
-        layer["kernel"],
+        x[None].astype(jnp.bfloat16) if narrow else x[None],
+        kernel.astype(jnp.bfloat16) if narrow else kernel,
         (1, 1),
         "SAME",
         dimension_numbers=("NHWC", "HWIO", "NHWC"),
-        precision=precision,
+        precision=None if narrow else precision,
+        preferred_element_type=x.dtype if narrow else None,
     )[0]
     return value + layer["bias"] if "bias" in layer else value
 
