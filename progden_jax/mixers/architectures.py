@@ -21,6 +21,7 @@ class Architecture(Protocol):
     Training calls it with (x, σ²) and (y, SURE) swapped in half of the cases (paper, section 4.3): it must
     then give the weight of x in a mix that starts from y. The closed form has that property, for its
     numerator becomes SURE − divergence; so anything built on the same quantities has it.
+    Leading axes of the images are a batch.
     """
 
     def init(self, key: jax.Array) -> Params:
@@ -30,14 +31,14 @@ class Architecture(Protocol):
     def apply(
         self,
         params: Params,
-        x: Float[Array, "h w 3"],
-        y: Float[Array, "h w 3"],
-        variance: Float[Array, "h w 3"],
-        divergence: Float[Array, "h w 3"],
-        sure: Float[Array, "h w 3"],
+        x: Float[Array, "*b h w 3"],
+        y: Float[Array, "*b h w 3"],
+        variance: Float[Array, "*b h w 3"],
+        divergence: Float[Array, "*b h w 3"],
+        sure: Float[Array, "*b h w 3"],
         *,
         inside: Bool[Array, "h w 1"] | None = None,
-    ) -> Float[Array, "h w 3"]:
+    ) -> Float[Array, "*b h w 3"]:
         """α in [0, 1]; as if the image ended where `inside` is False."""
         ...
 
@@ -77,14 +78,14 @@ class Paper:
     def apply(
         self,
         params: Params,
-        x: Float[Array, "h w 3"],
-        y: Float[Array, "h w 3"],
-        variance: Float[Array, "h w 3"],
-        divergence: Float[Array, "h w 3"],
-        sure: Float[Array, "h w 3"],
+        x: Float[Array, "*b h w 3"],
+        y: Float[Array, "*b h w 3"],
+        variance: Float[Array, "*b h w 3"],
+        divergence: Float[Array, "*b h w 3"],
+        sure: Float[Array, "*b h w 3"],
         *,
         inside: Bool[Array, "h w 1"] | None = None,
-    ) -> Float[Array, "h w 3"]:
+    ) -> Float[Array, "*b h w 3"]:
         del divergence
         features = mixing_features(x, y, variance, sure)
         if not self.sure:
@@ -100,8 +101,8 @@ class Paper:
 
 
 def from_log_weight(
-    alpha: Float[Array, "h w 3"], x: Float[Array, "h w 3"], y: Float[Array, "h w 3"]
-) -> Float[Array, "h w 3"]:
+    alpha: Float[Array, "*b h w 3"], x: Float[Array, "*b h w 3"], y: Float[Array, "*b h w 3"]
+) -> Float[Array, "*b h w 3"]:
     """The weight that does to radiance what `alpha` does to log(1 + radiance).
 
     With d = log(1 + y) − log(1 + x) it is (e^(αd) − 1) / (e^d − 1), which tends to α as d does to 0.

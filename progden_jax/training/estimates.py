@@ -16,6 +16,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from progden_jax._files import replacing
+from progden_jax._numeric import safe_sqrt
 from progden_jax.compilation import cache_folder
 from progden_jax.denoisers import Denoiser
 from progden_jax.divergence import Method
@@ -28,13 +29,13 @@ _VERSION = 1
 class Estimate(NamedTuple):
     """y = f(x), and the divergence σ²·∂f/∂x as estimated, (H, W, 3) each.
 
-    `probe` and `tangent` are one more σ·s of random signs s, and J·(σ·s): what a derivative along it needs.
+    `probe` and `tangent`, where asked for, are σ·s of other random signs s, and J·(σ·s).
     """
 
     denoised: Float[np.ndarray, "h w 3"]
     divergence: Float[np.ndarray, "h w 3"]
-    probe: Float[np.ndarray, "h w 3"]
-    tangent: Float[np.ndarray, "h w 3"]
+    probe: Float[np.ndarray, "h w 3"] | None = None
+    tangent: Float[np.ndarray, "h w 3"] | None = None
 
 
 def default_folder() -> Path:
@@ -50,6 +51,7 @@ class EstimateCache:
     denoiser, method : what estimates.
     folder : where to keep them, made if missing; by default `default_folder()`. Entries that are damaged
         are computed again. It may be deleted at any time.
+    tangents : also a probe and the denoiser's derivative along it, a third of the cost more.
     """
 
     def __init__(
@@ -57,14 +59,16 @@ class EstimateCache:
         denoiser: Denoiser,
         method: Method,
         folder: str | os.PathLike[str] | None = None,
+        *,
+        tangents: bool = False,
     ) -> None:
         self.folder = default_folder() if folder is None else Path(folder)
         self.hits = self.misses = 0
         self._denoiser = denoiser
         self._method = method
-        self._settings = _digest(
-            _VERSION, type(denoiser).__qualname__, str(jax.tree.structure(denoiser)), repr(method)
-        )
+        self._fields = Estimate._fields if tangents else Estimate._fields[:2]
+        kind, structure = type(denoiser).__qualname__, str(jax.tree.structure(denoiser))
+        self._settings = _digest(_VERSION, kind, structure, repr(method), self._fields)
         for leaf in jax.tree.leaves(denoiser):
             self._settings = _digest(self._settings, np.asarray(leaf))
 
@@ -76,44 +80,42 @@ class EstimateCache:
     def get(self, frame: Frame, seed: int = 0) -> Estimate:
         """The estimate for a repaired frame; `seed` is of the random probes."""
         path = self.folder / f"{self.key(frame, seed)}.safetensors"
-        shape = frame.color.shape
-        found = _read(path, shape)
+        found = self._read(path, frame.color.shape)
         if found is not None:
             self.hits += 1
             return found
         self.misses += 1
-        made = _estimate(frame, self._denoiser, jax.random.key(seed), method=self._method)
-        made = Estimate(*(np.asarray(a, np.float32) for a in made))
+        key, tangents = jax.random.key(seed), len(self._fields) > 2
+        made = _estimate(frame, self._denoiser, key, method=self._method, tangents=tangents)
+        arrays = {name: np.asarray(a) for name, a in zip(self._fields, made, strict=True)}
         self.folder.mkdir(parents=True, exist_ok=True)
-        tensors = made._asdict()
         with replacing(path) as temporary:
-            temporary.write_bytes(save(tensors, {"digest": _digest(*made)}))
-        return made
+            temporary.write_bytes(save(arrays, {"digest": _digest(*arrays.values())}))
+        return Estimate(**arrays)
+
+    def _read(self, path: Path, shape: tuple[int, ...]) -> Estimate | None:
+        try:
+            with safe_open(path, "numpy") as file:
+                digest = (file.metadata() or {})["digest"]
+                arrays = {name: file.get_tensor(name) for name in self._fields}
+        except (OSError, KeyError, SafetensorError):
+            return None
+        whole = all(a.shape == shape for a in arrays.values())
+        return Estimate(**arrays) if whole and _digest(*arrays.values()) == digest else None
 
 
-@functools.partial(jax.jit, static_argnames="method")
+@functools.partial(jax.jit, static_argnames=("method", "tangents"))
 def _estimate(
-    frame: Frame, denoiser: Denoiser, key: jax.Array, *, method: Any
+    frame: Frame, denoiser: Denoiser, key: jax.Array, *, method: Any, tangents: bool
 ) -> tuple[Array, ...]:
-    from progden_jax._numeric import safe_sqrt
-
     f = denoiser.bind(frame)
     assert frame.variance is not None
     y, divergence, *_ = method.evaluate(f, frame.color, frame.variance, key)
+    if not tangents:
+        return y, divergence
     signs = jax.random.rademacher(jax.random.fold_in(key, 2**31), y.shape, y.dtype)
     probe = safe_sqrt(frame.variance) * signs
     return y, divergence, probe, jax.jvp(f, (frame.color,), (probe,))[1]
-
-
-def _read(path: Path, shape: tuple[int, ...]) -> Estimate | None:
-    try:
-        with safe_open(path, "numpy") as file:
-            digest = (file.metadata() or {})["digest"]
-            found = Estimate(*(file.get_tensor(name) for name in Estimate._fields))
-    except (OSError, KeyError, SafetensorError):
-        return None
-    whole = all(a.shape == shape and a.dtype == np.float32 for a in found)
-    return found if whole and _digest(*found) == digest else None
 
 
 def _digest(*parts: Any) -> str:
