@@ -21,6 +21,8 @@ from progden_jax.divergence import (
 )
 from progden_jax.exr import ExrError, describe_exr, read_exr, write_exr
 from progden_jax.frame import Frame, Repairs, repair
+from progden_jax.mixers import NetworkMixer
+from progden_jax.mixers import load as load_mixer
 from progden_jax.mixing import ClosedForm, Mixer, MixingNet, closed_form_alpha, mixing_features
 from progden_jax.pipeline import Denoised, Result, denoise, progressive_denoise
 from progden_jax.sure import sure
@@ -40,6 +42,7 @@ __all__ = [
     "Mixer",
     "MixingNet",
     "MonteCarlo",
+    "NetworkMixer",
     "Probing",
     "Repairs",
     "Result",
@@ -50,6 +53,7 @@ __all__ = [
     "divergence",
     "divergence_and_error",
     "enable_compilation_cache",
+    "load_mixer",
     "metrics",
     "mixing_features",
     "progressive_denoise",

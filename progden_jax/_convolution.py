@@ -1,10 +1,12 @@
 """Convolution whose derivative by the kernel is fast on CPUs too."""
 
+import functools
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 _LAYOUT = ("NHWC", "HWIO", "NHWC")
@@ -34,7 +36,7 @@ def _convolve(inputs: Array, kernel: Array) -> Array:
     )
 
 
-@jax.custom_vjp
+@jax.custom_jvp
 def same_convolution(
     inputs: Float[Array, "n h w ci"], kernel: Float[Array, "kh kw ci co"]
 ) -> Float[Array, "n h w co"]:
@@ -46,38 +48,29 @@ def same_convolution(
     return _convolve(inputs, kernel)
 
 
-def _forward(inputs: Array, kernel: Array) -> tuple[Array, tuple[Array, Array]]:
-    return _convolve(inputs, kernel), (inputs, kernel)
+@functools.partial(same_convolution.defjvp, symbolic_zeros=True)
+def _jvp(primals: tuple[Array, Array], tangents: tuple[Any, Any]) -> tuple[Array, Array]:
+    (inputs, kernel), (by_inputs, by_kernel) = primals, tangents
+    out = same_convolution(inputs, kernel)
+    slope = jnp.zeros_like(out)
+    if not isinstance(by_inputs, SymbolicZero):
+        slope = slope + same_convolution(by_inputs, kernel)
+    if not isinstance(by_kernel, SymbolicZero):
+        along = _by_products if jax.default_backend() == "cpu" else _convolve
+        slope = slope + along(inputs, by_kernel)
+    return out, slope
 
 
-def _backward(saved: tuple[Array, Array], slope: Array) -> tuple[Array, Array]:
-    inputs, kernel = saved
-    by_inputs = jax.vjp(lambda x: _convolve(x, kernel), inputs)[1](slope)[0]
-    by_kernel = lax.platform_dependent(
-        inputs,
-        kernel,
-        slope,
-        cpu=_by_products,
-        default=lambda x, k, g: jax.vjp(lambda k: _convolve(x, k), k)[1](g)[0],
-    )
-    return by_inputs, by_kernel
-
-
-def _by_products(inputs: Array, kernel: Array, slope: Array) -> Array:
-    """Σ over images and pixels of input × slope per tap: rows of taps are one product each."""
+def _by_products(inputs: Array, kernel: Array) -> Array:
+    """The convolution again, in a form whose transpose by the kernel is one product per image and row of taps."""
     (kh, kw, ci, co), (_, h, w, _) = kernel.shape, inputs.shape
 
-    def add(total: Array, pair: tuple[Array, Array]) -> tuple[Array, None]:
-        image, by_output = pair
+    @jax.checkpoint  # else the columns of all images are kept
+    def one(image: Array, kernel: Array) -> Array:
         padded = jnp.pad(image, ((kh // 2,) * 2, (kw // 2,) * 2, (0, 0)))
         columns = jnp.concatenate([padded[:, j : j + w] for j in range(kw)], axis=-1)
-        flat = by_output.reshape(h * w, co)
-        rows = [flat.T @ columns[i : i + h].reshape(h * w, kw * ci) for i in range(kh)]
-        return total + jnp.stack(rows), None
+        rows = kernel.reshape(kh, kw * ci, co)
+        flat = sum(columns[i : i + h].reshape(h * w, kw * ci) @ rows[i] for i in range(kh))
+        return jnp.reshape(flat, (h, w, co))
 
-    zero = jnp.zeros((kh, co, kw * ci), inputs.dtype)
-    total, _ = lax.scan(add, zero, (inputs, slope))
-    return total.transpose(0, 2, 1).reshape(kernel.shape)
-
-
-same_convolution.defvjp(_forward, _backward)
+    return lax.map(lambda image: one(image, kernel), inputs)

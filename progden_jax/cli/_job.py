@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 import progden_jax as pd
+from progden_jax import mixers
 from progden_jax.cli._compare import Scores, compare
 from progden_jax.cli._options import SAVE_ALWAYS, EstimateOptions, NetworkOptions, ReadOptions
 from progden_jax.cli._paths import Item
@@ -43,6 +44,7 @@ class Outcome:
     denoiser: str | None = None
     auxiliary: tuple[str, ...] = ()
     method: str | None = None
+    mixer: str | None = None
     mean_alpha: float | None = None
     mean_sure: float | None = None
     repairs: dict[str, int] = field(default_factory=dict)
@@ -162,8 +164,10 @@ def _denoise(
     else:
         method = estimate.build()
         outcome.mode, outcome.method = "progressive", repr(method)
+        mixer = mixers.load(estimate.mixer) if estimate.mixer else mixers.default_for(denoiser)
+        outcome.mixer = repr(mixer)
         result = pd.progressive_denoise(
-            frame, denoiser, method=method, key=jax.random.key(estimate.seed)
+            frame, denoiser, mixer=mixer, method=method, key=jax.random.key(estimate.seed)
         )
         repairs, image = result.repairs, np.asarray(result.image)
         names = ("alpha", "denoised", "sure", "divergence")
