@@ -33,9 +33,7 @@ def convolve(inputs: Array, kernel: Array, *arguments: Any, **settings: Any) -> 
 
 
 def _convolve(inputs: Array, kernel: Array) -> Array:
-    return lax.conv_general_dilated(
-        inputs, kernel, (1, 1), "SAME", dimension_numbers=_LAYOUT
-    )
+    return lax.conv_general_dilated(inputs, kernel, (1, 1), "SAME", dimension_numbers=_LAYOUT)
 
 
 @jax.custom_jvp

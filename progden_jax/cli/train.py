@@ -24,7 +24,7 @@ tensorboard --logdir runs
 ```
 """
 
-_MIXER_HELP = """Train a mixing network for one denoiser; the best weights so far are OUTPUT/weights.safetensors.
+_MIXER_HELP = """Train a mixing network for one denoiser; the best so far are OUTPUT/weights.safetensors.
 
 The same command goes on where it was killed, and comes to the same weights. Give them to
 `progden denoise --mixer`. Denoised images and their divergences are kept in a cache folder between runs.
@@ -180,7 +180,9 @@ class _Report:
     def evaluated(self, step: int, scores: "Scores", *, best: bool) -> None:
         if self._quiet:
             return
-        line = f"step {step}: score {scores.score:.4f}{' (best)' if best else ''}; {_summary(scores)}"
+        line = (
+            f"step {step}: score {scores.score:.4f}{' (best)' if best else ''}; {_summary(scores)}"
+        )
         if self._bar.disable or not sys.stdout.isatty():
             print(line, flush=True)
         else:
@@ -191,7 +193,10 @@ class _Report:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
     ) -> None:
         self._bar.stop()
 
@@ -206,4 +211,3 @@ def _summary(scores: "Scores") -> str:
             means.append(f"{image} {sum(values) / len(values):.4f}")
         parts.append(f"{metric.upper()} {', '.join(means)}")
     return "; ".join(parts)
-

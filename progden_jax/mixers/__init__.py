@@ -132,7 +132,7 @@ def save_mixer(
     dtype: str = "float32",
     **metadata: str,
 ) -> None:
-    """Write a mixer's weights and settings as safetensors; an existing file is replaced at once or not at all.
+    """Write a mixer's weights and settings as safetensors; a file that exists is replaced whole or not at all.
 
     Parameters
     ----------

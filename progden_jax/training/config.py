@@ -8,9 +8,12 @@ import types
 import typing
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from progden_jax import _checks
+
+Meaning = Literal["mean", "samples", "std", "second-moment"]
+"""What variance channels hold, see `progden_jax.read_exr`."""
 
 _FOLDER = Path(__file__).parent / "configs"
 
@@ -23,7 +26,7 @@ class RunConfig:
     data: tuple[str, ...] = ()  # folders of NAME_SSSSSSspp.exr, searched with their subfolders
     spp: tuple[int, ...] = ()  # samples per pixel to train on; none: all but the reference's
     reference_spp: int = 0  # of the reference; 0: the highest of each scene
-    variance_of: str = "mean"  # what variance channels hold, see progden_jax.read_exr
+    variance_of: Meaning = "mean"  # what variance channels hold
     held_out: float = 0.15  # share of scenes kept for evaluation, chosen by a hash of their names
     held_out_scenes: tuple[str, ...] = ()  # or these scenes instead
     batch: int = 12  # crops per step
@@ -61,7 +64,6 @@ class RunConfig:
             _within(self, name, 0, float("inf"), "a number above 0", closed=False)
         _checks.choice("loss", self.loss, ("smape", "relmse", "l1", "logl1", "sure"))
         _checks.choice("precision", self.precision, ("default", "high", "highest"))
-        _checks.choice("variance_of", self.variance_of, ("mean", "samples", "std", "second-moment"))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -209,6 +211,9 @@ _READERS = {".toml": _toml, ".yaml": _yaml, ".yml": _yaml}
 
 def _typed(name: str, value: Any, hint: Any) -> Any:
     """`value` as the field's type, where that loses nothing."""
+    if typing.get_origin(hint) is Literal:
+        _checks.choice(name, value, typing.get_args(hint))
+        return value
     if typing.get_origin(hint) is tuple:
         (element, *_) = typing.get_args(hint)
         if not isinstance(value, list | tuple):

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 import progden_jax as pd
+from progden_jax.training.config import Meaning
 from progden_jax.training.estimates import EstimateCache
 from progden_jax.training.index import Item
 
@@ -29,7 +30,7 @@ class Examples(NamedTuple):
 def load(
     items: Sequence[Item],
     *,
-    variance_of: str = "mean",
+    variance_of: Meaning = "mean",
     cache: EstimateCache | None = None,
     draws: int = 1,
     auxiliary: Sequence[str] = (),
@@ -89,7 +90,7 @@ def load(
 _repair = jax.jit(lambda frame: pd.repair(frame)[0])
 
 
-def _repaired(item: Item, variance_of: str, *, reference: bool = False) -> pd.Frame:
+def _repaired(item: Item, variance_of: Meaning, *, reference: bool = False) -> pd.Frame:
     if reference:
         frame = pd.read_exr(item.reference, auxiliary=False).replace(variance=None, spp=None)
     else:

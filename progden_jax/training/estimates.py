@@ -1,6 +1,6 @@
 """Denoised images and divergences, computed once and kept on disk.
 
-They depend on the render, the denoiser, the method and its seed alone, and cost far more than a training step.
+They depend on render, denoiser, method and seed alone, and cost far more than a step of training.
 """
 
 import functools

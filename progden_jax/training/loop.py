@@ -117,7 +117,10 @@ def train(
                         )
                     pending = []
                     seconds = (time.perf_counter() - begin) / (step - begun)
-                    values |= {"rate": float(rate(step - 1)), "seconds_per_step": seconds}
+                    values |= {
+                        "rate": float(np.asarray(rate(step - 1))),
+                        "seconds_per_step": seconds,
+                    }
                     begin, begun = time.perf_counter(), step
                     curves.write(step, {f"train/{k}": v for k, v in values.items()})
                 if report:

@@ -110,9 +110,7 @@ class MixerTask:
         def mix(x: Array, y: Array, divergence: Array) -> Array:
             risk = sure_of(x, y, variance, divergence)
             swap = batch["swap"][:, None, None, None]
-            found = swapped_alpha(
-                self.architecture, params, x, y, variance, divergence, risk, swap
-            )
+            found = swapped_alpha(self.architecture, params, x, y, variance, divergence, risk, swap)
             if self.config.bound:
                 found = jax.vmap(_bounded)(found, x, y, variance, batch["mean_variance"])
             return found
