@@ -22,6 +22,8 @@ from progden_jax.divergence import (
 )
 from progden_jax.exr import ExrError, describe_exr, read_exr, write_exr
 from progden_jax.frame import Frame, Repairs, repair
+from progden_jax.mixers import NetworkMixer
+from progden_jax.mixers import load as load_mixer
 from progden_jax.mixing import ClosedForm, Mixer, MixingNet, closed_form_alpha, mixing_features
 from progden_jax.pipeline import Denoised, Result, denoise, progressive_denoise
 from progden_jax.sure import sure
@@ -41,6 +43,7 @@ __all__ = [
     "Mixer",
     "MixingNet",
     "MonteCarlo",
+    "NetworkMixer",
     "Probing",
     "Repairs",
     "Result",
@@ -52,6 +55,7 @@ __all__ = [
     "divergence_and_error",
     "enable_compilation_cache",
     "exact_divergence",
+    "load_mixer",
     "metrics",
     "mixing_features",
     "progressive_denoise",

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from progden_jax import _checks, _windows
+from progden_jax._convolution import convolve
 from progden_jax._numeric import safe_sqrt
 
 FEATURES = 18
@@ -66,29 +67,41 @@ class MixingNet(nn.Module):
     """The paper's mixing network (section 4.3): features (..., H, W, 18) to α (..., H, W, 3) in [0, 1].
 
     conv 5×5 to 48 channels, two residual blocks of two 3×3, conv 3×3 to 9, then `f_act` on three
-    groups of three; zero padding throughout; about 108 thousand weights.
+    groups of three; zero padding throughout; about 108 thousand weights. Without `ratio` (the paper's
+    ablation) conv_out has 3 channels, and α is their logistic sigmoid.
     """
 
     width: int = 48
+    ratio: bool = True
 
     def setup(self) -> None:
-        self.conv_in = nn.Conv(self.width, (5, 5), padding="SAME")
-        self.block1_conv1 = nn.Conv(self.width, (3, 3), padding="SAME")
-        self.block1_conv2 = nn.Conv(self.width, (3, 3), padding="SAME")
-        self.block2_conv1 = nn.Conv(self.width, (3, 3), padding="SAME")
-        self.block2_conv2 = nn.Conv(self.width, (3, 3), padding="SAME")
-        self.conv_out = nn.Conv(9, (3, 3), padding="SAME")
+        self.conv_in = self._conv(self.width, 5)
+        self.block1_conv1 = self._conv(self.width, 3)
+        self.block1_conv2 = self._conv(self.width, 3)
+        self.block2_conv1 = self._conv(self.width, 3)
+        self.block2_conv2 = self._conv(self.width, 3)
+        self.conv_out = self._conv(9 if self.ratio else 3, 3)
 
-    def __call__(self, features: Float[Array, "*b h w 18"]) -> Float[Array, "*b h w 3"]:
+    def _conv(self, channels: int, size: int) -> nn.Conv:
+        return nn.Conv(channels, (size, size), padding="SAME", conv_general_dilated=convolve)
+
+    def __call__(
+        self, features: Float[Array, "*b h w 18"], *, inside: Bool[Array, "h w 1"] | None = None
+    ) -> Float[Array, "*b h w 3"]:
+        """α; `inside` is False where the features are padding around the image."""
         _checks.images("features", features, channels=FEATURES)
-        h = nn.relu(self.conv_in(features))
+
+        def masked(h: Array) -> Array:
+            return h if inside is None else jnp.where(inside, h, 0)
+
+        h = masked(nn.relu(self.conv_in(masked(features))))
         for first, second in (
             (self.block1_conv1, self.block1_conv2),
             (self.block2_conv1, self.block2_conv2),
         ):
-            h = nn.relu(h + second(nn.relu(first(h))))
-        x1, x2, x3 = jnp.split(self.conv_out(h), 3, axis=-1)
-        return f_act(x1, x2, x3)
+            h = masked(nn.relu(h + second(masked(nn.relu(first(h))))))
+        out = self.conv_out(h)
+        return f_act(*jnp.split(out, 3, axis=-1)) if self.ratio else nn.sigmoid(out)
 
 
 def closed_form_alpha(

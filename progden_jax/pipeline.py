@@ -13,14 +13,13 @@ from progden_jax import _checks
 from progden_jax.denoisers import Denoiser
 from progden_jax.divergence import Method, MonteCarlo
 from progden_jax.frame import Frame, Repairs, repair
-from progden_jax.mixing import ClosedForm, Mixer
+from progden_jax.mixers import default_for
+from progden_jax.mixing import Mixer
 from progden_jax.sure import sure
 from progden_jax.tstatistic import t_bound
 
 DEFAULT_METHOD = MonteCarlo(probes=1)
 """One probe: averaging windows remove its noise, see experiments/main_job."""
-
-DEFAULT_MIXER = ClosedForm()
 
 
 class Result(NamedTuple):
@@ -70,7 +69,8 @@ def progressive_denoise(
     ----------
     frame : one frame with a variance; map over a batch with ``jax.vmap``.
     denoiser : see `progden_jax.denoisers.load`, or any `Denoiser`.
-    mixer : gives α; by default the closed form over 15×15 windows.
+    mixer : gives α; by default what `mixers.default_for` has for the denoiser: a network shipped for
+        it, else the closed form over 15×15 windows.
     method : estimator of the divergence; by default `MonteCarlo` with one probe.
     key : of the random probes; None stands for ``jax.random.key(0)``.
     divergence : σ²·∂f/∂x where it is known already, as from `exact_divergence`, of
@@ -100,7 +100,7 @@ def progressive_denoise(
             raise ValueError(
                 f"a divergence is given and a method, {method!r}, to find it: give one of them."
             )
-    mixer = DEFAULT_MIXER if mixer is None else mixer
+    mixer = default_for(denoiser) if mixer is None else mixer
     method = DEFAULT_METHOD if method is None else method
     key = jax.random.key(0) if key is None else key
     return _on_canvas(

@@ -16,6 +16,7 @@ from progden_jax.cli.devices import HELP as DEVICES_HELP
 from progden_jax.cli.devices import devices
 from progden_jax.cli.info import HELP as INFO_HELP
 from progden_jax.cli.info import info
+from progden_jax.cli.train import app as train
 
 app = App(
     name="progden",
@@ -36,6 +37,7 @@ _COMMANDS = {
 for _name, (_command, _arguments, _help) in _COMMANDS.items():
     _usage = f"Usage: progden {_name} {_arguments}"
     app.command(_command, name=_name, help=_help, usage=_usage)
+app.command(train)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -44,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if "--debug" in arguments:
         os.environ["PROGDEN_DEBUG"] = "1"
         arguments = [a for a in arguments if a != "--debug"]
-    command = arguments[0] if arguments and arguments[0] in _COMMANDS else ""
+    command = arguments[0] if arguments and arguments[0] in (*_COMMANDS, "train") else ""
 
     def call() -> int | None:
         return app(arguments, exit_on_error=False, print_error=False, result_action="return_value")

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 import progden_jax as pd
+from progden_jax import mixers
 from progden_jax.cli._compare import Scores, compare
 from progden_jax.cli._options import SAVE_ALWAYS, EstimateOptions, NetworkOptions, ReadOptions
 from progden_jax.cli._paths import Item
@@ -47,6 +48,7 @@ class Outcome:
     denoiser: str | None = None
     auxiliary: tuple[str, ...] = ()
     method: str | None = None
+    mixer: str | None = None
     mean_alpha: float | None = None
     mean_sure: float | None = None
     repairs: dict[str, int] = field(default_factory=dict)
@@ -184,7 +186,11 @@ def _denoise(
         if isinstance(method, pd.Exact):
             divergence, checkpoint = _exactly(frame, denoiser, method, outcome, progress)
             how = {"divergence": divergence}
-        result = pd.progressive_denoise(frame, denoiser, key=jax.random.key(estimate.seed), **how)
+        mixer = mixers.load(estimate.mixer) if estimate.mixer else mixers.default_for(denoiser)
+        outcome.mixer = repr(mixer)
+        result = pd.progressive_denoise(
+            frame, denoiser, mixer=mixer, key=jax.random.key(estimate.seed), **how
+        )
         repairs, image = result.repairs, np.asarray(result.image)
         names = ("alpha", "denoised", "sure", "divergence")
         maps = {name: np.asarray(getattr(result, name)) for name in names}

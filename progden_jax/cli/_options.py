@@ -228,6 +228,13 @@ class EstimateOptions:
         int | None, Parameter(help="Random probes: more cost time and smooth the SURE map.")
     ] = None
     seed: Annotated[int, Parameter(help="Of the random probes [default: 0].")] = 0
+    mixer: Annotated[
+        str | None,
+        Parameter(
+            help="What gives the share of the denoised image: closed-form, the name of a denoiser that a "
+            "network is shipped for, or a .safetensors file [default: the denoiser's, else closed-form]."
+        ),
+    ] = None
 
     def check(self) -> None:
         """Raise UsageError for what is wrong whatever the files hold."""
@@ -239,6 +246,13 @@ class EstimateOptions:
             raise UsageError(f"--method {self.method} is exact and takes no --probes.")
         if not 0 <= self.seed < 2**32:
             raise UsageError(f"--seed is {self.seed}, expected 0 to {2**32 - 1}.")
+        if self.mixer is not None:
+            from progden_jax import mixers
+
+            try:
+                mixers.load(self.mixer)
+            except ValueError as error:
+                raise UsageError(f"--mixer: {error}") from None
 
     def build(self) -> "Method":
         """The estimator."""

@@ -1,0 +1,173 @@
+"""Mixers: α in closed form or from a network, found by name or read from a file."""
+
+import dataclasses
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax.traverse_util import flatten_dict
+from jaxtyping import Array, Bool, Float
+
+from progden_jax import _safetensors
+from progden_jax.mixers.architectures import ARCHITECTURES, Architecture, Params, build, name_of
+from progden_jax.mixing import ClosedForm, Mixer
+
+__all__ = [
+    "ARCHITECTURES",
+    "CLOSED_FORM",
+    "Architecture",
+    "NetworkMixer",
+    "build",
+    "default_for",
+    "load",
+    "name_of",
+    "names",
+    "save_mixer",
+]
+
+CLOSED_FORM = "closed-form"
+"""The name of the mixer that needs no weights."""
+
+_FOLDER = Path(__file__).parents[1] / "weights"
+_PREFIX = "mixer-"
+_SUFFIX = _safetensors.ENDING
+
+
+@jax.tree_util.register_pytree_node_class
+class NetworkMixer:
+    """A learned mixer: a pytree with its weights as leaves.
+
+    Parameters
+    ----------
+    params : nested names -> arrays.
+    architecture : what to do with them, see `ARCHITECTURES`.
+    metadata : where they come from, for people; not carried through ``jit``.
+    """
+
+    def __init__(
+        self,
+        params: Params,
+        architecture: Architecture,
+        *,
+        metadata: Mapping[str, str] | None = None,
+    ) -> None:
+        self.params = params
+        self.architecture = architecture
+        self.metadata = dict(metadata or {})
+
+    def __call__(
+        self,
+        x: Float[Array, "h w 3"],
+        y: Float[Array, "h w 3"],
+        variance: Float[Array, "h w 3"],
+        divergence: Float[Array, "h w 3"],
+        sure: Float[Array, "h w 3"],
+        *,
+        inside: Bool[Array, "h w 1"] | None = None,
+    ) -> Float[Array, "h w 3"]:
+        """α in [0, 1], (H, W, 3); see `Mixer`."""
+        # GPUs would else take TF32.
+        with jax.default_matmul_precision("highest"):
+            return self.architecture.apply(
+                self.params, x, y, variance, divergence, sure, inside=inside
+            )
+
+    def __repr__(self) -> str:
+        return f"NetworkMixer({self.architecture})"
+
+    def tree_flatten(self) -> tuple[tuple[Params], Architecture]:
+        return (self.params,), self.architecture
+
+    @classmethod
+    def tree_unflatten(cls, architecture: Architecture, children: tuple[Params]) -> "NetworkMixer":
+        return cls(children[0], architecture)
+
+
+def names() -> tuple[str, ...]:
+    """The names that `load` knows: the closed form, and the denoisers that a mixer is shipped for."""
+    shipped = sorted(p.name for p in _FOLDER.glob(f"{_PREFIX}*{_SUFFIX}"))
+    return (CLOSED_FORM, *(n.removeprefix(_PREFIX).removesuffix(_SUFFIX) for n in shipped))
+
+
+def load(name: str | os.PathLike[str]) -> Mixer:
+    """The mixer of that name, or of the weights file (.safetensors) at that path.
+
+    Parameters
+    ----------
+    name : one of `names()`, such as "closed-form" or "oidn-hdr", or a path that ends in .safetensors.
+
+    Raises
+    ------
+    ValueError
+        If there is no such name or file, or the file holds no mixer.
+    """
+    text = os.fspath(name)
+    if text.endswith(_SUFFIX):
+        return _read(Path(text))
+    if text == CLOSED_FORM:
+        return ClosedForm()
+    if text in names():
+        return _read(_FOLDER / f"{_PREFIX}{text}{_SUFFIX}")
+    raise ValueError(
+        f"mixer is {text!r}, expected one of {', '.join(names())}, or a path that ends in {_SUFFIX}."
+    )
+
+
+def default_for(denoiser: Any) -> Mixer:
+    """The mixer that is shipped for this denoiser, or the closed form where none is."""
+    name = getattr(denoiser, "name", None)
+    return load(name if name in names() else CLOSED_FORM)
+
+
+def save_mixer(
+    path: str | os.PathLike[str],
+    mixer: NetworkMixer,
+    *,
+    dtype: str = "float32",
+    **metadata: str,
+) -> None:
+    """Write a mixer's weights and settings as safetensors, whole or not at all.
+
+    Parameters
+    ----------
+    dtype : "float16" halves the file, at about three digits.
+    metadata : what more to say of it, such as the denoiser it was trained for, added to the mixer's own.
+
+    Raises
+    ------
+    ValueError
+        If the path does not end in .safetensors, or a weight is not finite in that type.
+    """
+    said = {
+        **mixer.metadata,
+        **metadata,
+        "kind": "mixer",
+        "architecture": name_of(mixer.architecture),
+        "options": json.dumps(dataclasses.asdict(mixer.architecture)),  # pyright: ignore[reportArgumentType]
+    }
+    _safetensors.write(path, mixer.params, said, dtype=dtype)
+
+
+def _read(path: Path) -> NetworkMixer:
+    params, metadata = _safetensors.read(path)
+    if metadata.get("kind") != "mixer":
+        raise ValueError(
+            f"{path} holds no mixer (its metadata says {metadata.get('kind', 'nothing')!r}): "
+            "give a file from `progden train mixer` or progden_jax.mixers.save_mixer."
+        )
+    try:
+        architecture = build(metadata["architecture"], json.loads(metadata["options"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: {error}") from None
+    expected = jax.eval_shape(architecture.init, jax.random.key(0))
+    if _shapes(expected) != _shapes(params):
+        raise ValueError(f"{path}: its tensors are not those of the architecture {architecture}.")
+    return NetworkMixer(jax.tree.map(jnp.asarray, params), architecture, metadata=metadata)
+
+
+def _shapes(params: Any) -> dict[str, tuple[int, ...]]:
+    return {name: leaf.shape for name, leaf in flatten_dict(params, sep=".").items()}

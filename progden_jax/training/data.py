@@ -1,0 +1,106 @@
+"""Renders, references and estimates as arrays in memory, one per buffer with the examples stacked."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+import progden_jax as pd
+from progden_jax.training.config import Meaning
+from progden_jax.training.estimates import EstimateCache
+from progden_jax.training.index import Item
+
+Progress = Callable[[int, int], None]
+"""Called with how many of how many are done."""
+
+
+class Examples(NamedTuple):
+    """`arrays` are (N, H, W, C), but for mean_variance (N,) and divergence (N, draws, H, W, 3)."""
+
+    items: tuple[Item, ...]
+    arrays: dict[str, np.ndarray]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width, of all of them."""
+        return self.arrays["color"].shape[1:3]
+
+
+def load(
+    items: Sequence[Item],
+    *,
+    variance_of: Meaning = "mean",
+    cache: EstimateCache | None = None,
+    draws: int = 1,
+    auxiliary: Sequence[str] = (),
+    progress: Progress = lambda done, total: None,
+) -> Examples:
+    """The examples, bad pixels repaired.
+
+    Parameters
+    ----------
+    cache : gives denoised images and divergences; None leaves them out.
+    draws : divergences of so many seeds per render.
+    auxiliary : buffers to take besides, of albedo, normal and depth.
+
+    Raises
+    ------
+    ValueError
+        If sizes differ, or a render lacks a variance or a buffer asked for.
+    """
+    rows: dict[str, list] = {}
+    references: dict[object, np.ndarray] = {}
+    size = None
+    for done, item in enumerate(items):
+        progress(done, len(items))
+        frame = _repaired(item, variance_of)
+        if size is None:
+            size = frame.size
+        if frame.size != size:
+            raise ValueError(
+                f"{item.path} is {_size(frame.size)} pixels and {items[0].path} is {_size(size)}: the images "
+                "that are trained on must be of one size; cut them into crops of it."
+            )
+        if item.reference not in references:
+            references = {item.reference: np.asarray(_repaired(item, "mean", reference=True).color)}
+        reference = references[item.reference]
+        if reference.shape[:2] != size:
+            raise ValueError(
+                f"{item.reference} is {_size(reference.shape)} pixels but {item.path} is {_size(size)}."
+            )
+        row = {"color": frame.color, "variance": frame.variance, "reference": reference}
+        row["mean_variance"] = np.asarray(frame.variance).mean(dtype=np.float64)
+        for name in auxiliary:
+            row[name] = getattr(frame, name)
+            if row[name] is None:
+                raise ValueError(f"{item.path} has no {name}, which this denoiser takes.")
+        if cache is not None:
+            found = [cache.get(frame, seed) for seed in range(draws)]
+            row["denoised"] = found[0].denoised
+            row["divergence"] = np.stack([estimate.divergence for estimate in found])
+            if found[0].probe is not None:
+                row["probe"], row["tangent"] = found[0].probe, found[0].tangent
+        for name, value in row.items():
+            rows.setdefault(name, []).append(np.asarray(value, np.float32))
+    progress(len(items), len(items))
+    return Examples(tuple(items), {name: np.stack(values) for name, values in rows.items()})
+
+
+_repair = jax.jit(lambda frame: pd.repair(frame)[0])
+
+
+def _repaired(item: Item, variance_of: Meaning, *, reference: bool = False) -> pd.Frame:
+    if reference:
+        frame = pd.read_exr(item.reference, auxiliary=False).replace(variance=None, spp=None)
+    else:
+        frame = pd.read_exr(item.path, variance_of=variance_of).replace(spp=None)
+        if frame.variance is None:
+            raise ValueError(
+                f"{item.path} has no variance, and training needs that of the sample mean."
+            )
+    return _repair(frame)
+
+
+def _size(size: Sequence[int]) -> str:
+    return f"{size[1]}×{size[0]}"

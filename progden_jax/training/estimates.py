@@ -1,0 +1,130 @@
+"""Denoised images and divergences, computed once and kept on disk.
+
+They depend on render, denoiser, method and seed alone, and cost far more than a step of training.
+"""
+
+import functools
+import hashlib
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from progden_jax._files import replacing
+from progden_jax._numeric import safe_sqrt
+from progden_jax.compilation import cache_folder
+from progden_jax.denoisers import Denoiser
+from progden_jax.divergence import Method
+from progden_jax.frame import Frame
+
+_VERSION = 1
+"""Part of every key: raise it when the arithmetic changes, so that old entries are left alone."""
+
+
+class Estimate(NamedTuple):
+    """y = f(x), and the divergence σ²·∂f/∂x as estimated, (H, W, 3) each.
+
+    `probe` and `tangent`, where asked for, are σ·s of other random signs s, and J·(σ·s).
+    """
+
+    denoised: Float[np.ndarray, "h w 3"]
+    divergence: Float[np.ndarray, "h w 3"]
+    probe: Float[np.ndarray, "h w 3"] | None = None
+    tangent: Float[np.ndarray, "h w 3"] | None = None
+
+
+def default_folder() -> Path:
+    """Where estimates are kept unless said otherwise: a subfolder of the compilation cache."""
+    return cache_folder() / "estimates"
+
+
+class EstimateCache:
+    """Estimates of one denoiser by one method, from disk where they are there.
+
+    Parameters
+    ----------
+    denoiser, method : what estimates.
+    folder : where to keep them, made if missing; by default `default_folder()`. Entries that are damaged
+        are computed again. It may be deleted at any time.
+    tangents : also a probe and the denoiser's derivative along it, a third of the cost more.
+    """
+
+    def __init__(
+        self,
+        denoiser: Denoiser,
+        method: Method,
+        folder: str | os.PathLike[str] | None = None,
+        *,
+        tangents: bool = False,
+    ) -> None:
+        self.folder = default_folder() if folder is None else Path(folder)
+        self.hits = self.misses = 0
+        self._denoiser = denoiser
+        self._method = method
+        self._fields = Estimate._fields if tangents else Estimate._fields[:2]
+        kind, structure = type(denoiser).__qualname__, str(jax.tree.structure(denoiser))
+        self._settings = _digest(_VERSION, kind, structure, repr(method), self._fields)
+        for leaf in jax.tree.leaves(denoiser):
+            self._settings = _digest(self._settings, np.asarray(leaf))
+
+    def key(self, frame: Frame, seed: int) -> str:
+        """Equal for equal buffers, denoiser (its weights included), method and seed; else different."""
+        buffers = (frame.color, frame.variance, frame.albedo, frame.normal, frame.depth)
+        return _digest(self._settings, seed, *buffers)
+
+    def get(self, frame: Frame, seed: int = 0) -> Estimate:
+        """The estimate for a repaired frame; `seed` is of the random probes."""
+        path = self.folder / f"{self.key(frame, seed)}.safetensors"
+        found = self._read(path, frame.color.shape)
+        if found is not None:
+            self.hits += 1
+            return found
+        self.misses += 1
+        key, tangents = jax.random.key(seed), len(self._fields) > 2
+        made = _estimate(frame, self._denoiser, key, method=self._method, tangents=tangents)
+        arrays = {name: np.asarray(a) for name, a in zip(self._fields, made, strict=True)}
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as temporary:
+            temporary.write_bytes(save(arrays, {"digest": _digest(*arrays.values())}))
+        return Estimate(**arrays)
+
+    def _read(self, path: Path, shape: tuple[int, ...]) -> Estimate | None:
+        try:
+            with safe_open(path, "numpy") as file:
+                digest = (file.metadata() or {})["digest"]
+                arrays = {name: file.get_tensor(name) for name in self._fields}
+        except (OSError, KeyError, SafetensorError):
+            return None
+        whole = all(a.shape == shape for a in arrays.values())
+        return Estimate(**arrays) if whole and _digest(*arrays.values()) == digest else None
+
+
+@functools.partial(jax.jit, static_argnames=("method", "tangents"))
+def _estimate(
+    frame: Frame, denoiser: Denoiser, key: jax.Array, *, method: Any, tangents: bool
+) -> tuple[Array, ...]:
+    f = denoiser.bind(frame)
+    assert frame.variance is not None
+    y, divergence, *_ = method.evaluate(f, frame.color, frame.variance, key)
+    if not tangents:
+        return y, divergence
+    signs = jax.random.rademacher(jax.random.fold_in(key, 2**31), y.shape, y.dtype)
+    probe = safe_sqrt(frame.variance) * signs
+    return y, divergence, probe, jax.jvp(f, (frame.color,), (probe,))[1]
+
+
+def _digest(*parts: Any) -> str:
+    hashed = hashlib.blake2b(digest_size=20)
+    for part in parts:
+        if hasattr(part, "dtype"):
+            array = np.ascontiguousarray(part)
+            hashed.update(f"{array.dtype}{array.shape};".encode())
+            hashed.update(array.data)
+        else:
+            hashed.update(f"{part!r};".encode())
+    return hashed.hexdigest()

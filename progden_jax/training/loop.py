@@ -1,0 +1,182 @@
+"""The training loop: steps, curves, evaluation, checkpoints."""
+
+import os
+import subprocess
+import time
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+import progden_jax
+from progden_jax.training import order
+from progden_jax.training.checkpoints import Checkpoints, claim, describe
+from progden_jax.training.curves import Curves
+from progden_jax.training.evaluation import Scores
+from progden_jax.training.step import State, Task, initial_state, keep_best, make_step, schedule
+
+WEIGHTS = "weights.safetensors"
+"""The best weights so far, in the run's folder."""
+
+
+class Report(Protocol):
+    """What is told while training goes on."""
+
+    def started(self, step: int, steps: int) -> None:
+        """Training is about to begin, at this step of so many."""
+        ...
+
+    def stepped(self, step: int, values: dict[str, float] | None) -> None:
+        """A step is done; at intervals with the curves' values."""
+        ...
+
+    def evaluated(self, step: int, scores: Scores, *, best: bool) -> None:
+        """The held-out scenes were looked at."""
+        ...
+
+
+class Outcome(NamedTuple):
+    """What training came to: its last state, the file of the best weights, and whether it stopped early."""
+
+    state: State
+    weights: Path
+    stopped_early: bool
+
+
+def train(
+    task: Task,
+    folder: str | os.PathLike[str],
+    *,
+    report: Report | None = None,
+    until: int | None = None,
+    devices: Any = None,
+) -> Outcome:
+    """Train to the end of the schedule, or go on with what `folder` holds.
+
+    Checkpoints hold all that matters, and each step's examples follow from the seed and the step: a run that
+    was killed and gone on with gives the same weights, bit for bit, as one that was not. (On GPUs that
+    takes XLA_FLAGS=--xla_gpu_deterministic_ops=true, for cuDNN may sum in any order.)
+
+    Parameters
+    ----------
+    task : what to train, on what.
+    folder : of the run: checkpoints, curves, and the best weights so far. Made if missing.
+    until : stop after this step, as if killed but with a checkpoint; the schedule stays as it is.
+    devices : to share each batch between, by default all; the batch must be a multiple of their number.
+
+    Raises
+    ------
+    ValueError
+        If `folder` holds another run, the batch cannot be shared, or the loss is no longer finite.
+    """
+    config, folder = task.config, Path(folder)
+    devices = jax.devices() if devices is None else devices
+    if config.batch % len(devices):
+        raise ValueError(
+            f"batch is {config.batch}, which {len(devices)} devices cannot share: take a multiple."
+        )
+    claim(folder, describe(task.kind, config, task.items))
+    mesh = Mesh(np.asarray(devices), ("batch",))
+    everywhere = NamedSharding(mesh, PartitionSpec())
+    arrays = jax.device_put(dict(task.arrays), everywhere)
+    key = jax.device_put(jax.random.key(config.seed), everywhere)
+    step_function = make_step(task, mesh if len(devices) > 1 else None)
+    rate = schedule(config)
+    metadata = {"commit": commit(), "version": progden_jax.__version__, "seed": str(config.seed)}
+
+    with Checkpoints(folder) as checkpoints:
+        state = jax.device_put(initial_state(task), everywhere)
+        state = checkpoints.restore(state) or state
+        step, end = int(state.step), min(config.steps, until or config.steps)
+        if report:
+            report.started(step, config.steps)
+        with Curves(folder, step) as curves:
+            pending: list[dict[str, jax.Array]] = []
+            last: dict[str, jax.Array] = {}
+            begin, begun = time.perf_counter(), step
+            stopped = _exhausted(state, config)
+            while step < end and not stopped:
+                chosen = order.indices(
+                    step, count=len(task.items), batch=config.batch, seed=config.seed
+                )
+                state, scalars = step_function(state, arrays, key, jnp.asarray(chosen))
+                jax.block_until_ready(last)  # at most one step ahead
+                last = scalars
+                pending.append(scalars)
+                step += 1
+                values = None
+                if step % config.log_every == 0 or step == config.steps:
+                    values = _means(pending)
+                    if not np.isfinite(values["loss"]):
+                        raise ValueError(
+                            f"the loss is {values['loss']} at step {step}: lower peak_rate or clip_norm; "
+                            "the checkpoint before is kept."
+                        )
+                    pending = []
+                    seconds = (time.perf_counter() - begin) / (step - begun)
+                    values |= {
+                        "rate": float(np.asarray(rate(step - 1))),
+                        "seconds_per_step": seconds,
+                    }
+                    begin, begun = time.perf_counter(), step
+                    curves.write(step, {f"train/{k}": v for k, v in values.items()})
+                if report:
+                    report.stepped(step, values)
+                if step % config.evaluate_every == 0 or step == config.steps:
+                    state = _evaluate(task, state, folder, curves, metadata, report)
+                    stopped = _exhausted(state, config)
+                    begin, begun = time.perf_counter(), step
+                if step % config.checkpoint_every == 0 or step == end or stopped:
+                    checkpoints.save(state)
+    return Outcome(state, folder / WEIGHTS, stopped and step < config.steps)
+
+
+def _evaluate(
+    task: Task,
+    state: State,
+    folder: Path,
+    curves: Curves,
+    metadata: dict[str, str],
+    report: Report | None,
+) -> State:
+    scores = task.evaluate(state.average)
+    state = keep_best(state, jnp.float32(scores.score))
+    step, best = int(state.step), int(state.best_step) == int(state.step)
+    curves.write(step, {"held-out/score": scores.score} | scores.flat())
+    if best:
+        said = {**metadata, "steps": str(step), "score": f"{scores.score:.6f}"}
+        task.export(folder / WEIGHTS, state.best, said)
+    if report:
+        report.evaluated(step, scores, best=best)
+    return state
+
+
+def _exhausted(state: State, config: Any) -> bool:
+    return bool(config.patience) and int(state.stale) >= config.patience
+
+
+def _means(scalars: list[dict[str, jax.Array]]) -> dict[str, float]:
+    return {
+        name: float(np.mean([np.asarray(s[name], np.float64) for s in scalars]))
+        for name in scalars[0]
+    }
+
+
+def commit() -> str:
+    """The commit of the source tree that runs, "unknown" where it is no Git checkout."""
+    here = Path(__file__).parent
+    try:
+        found = subprocess.run(
+            ["git", "describe", "--always", "--dirty", "--abbrev=12"],
+            cwd=here,
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=10,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+    return found.stdout.strip()

@@ -1,0 +1,192 @@
+"""What it is to train a mixing network: its examples, loss and evaluation."""
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from progden_jax import denoisers
+from progden_jax.denoisers import OIDN
+from progden_jax.divergence import Exact, FiniteDifference, Method, MonteCarlo, Probing
+from progden_jax.mixers import NetworkMixer, build, save_mixer
+from progden_jax.mixers.architectures import Architecture, Params
+from progden_jax.sure import sure
+from progden_jax.training import augment, data, evaluation, losses
+from progden_jax.training.config import MixerConfig
+from progden_jax.training.estimates import EstimateCache
+from progden_jax.training.index import index, split
+from progden_jax.tstatistic import t_bound
+
+METHODS = {
+    "monte-carlo": MonteCarlo,
+    "monte-carlo-gaussian": lambda probes: MonteCarlo(probes, "gaussian"),
+    "finite-difference": FiniteDifference,
+    "probing": Probing,
+    "exact": lambda _: Exact(),
+}
+"""Estimators by the names that `progden denoise --method` has for them."""
+
+
+class MixerTask:
+    """A mixing network for one denoiser; see `loop.Task`.
+
+    Parameters
+    ----------
+    config : what to train on and how; `config.data` names the folders.
+    cache_folder : of denoised images and divergences, by default `estimates.default_folder()`.
+    progress : called with how many of how many renders are loaded.
+
+    Raises
+    ------
+    ValueError
+        If the data or the configuration will not do.
+    """
+
+    kind = "mixer"
+
+    def __init__(
+        self,
+        config: MixerConfig,
+        *,
+        cache_folder: str | os.PathLike[str] | None = None,
+        progress: data.Progress = lambda done, total: None,
+    ) -> None:
+        self.config = config
+        self.architecture = build(config.architecture, config.options)
+        denoiser = denoisers.load(config.denoiser)
+        if config.exposure_stops and not follows_exposure(denoiser):
+            raise ValueError(
+                f"exposure_stops is {config.exposure_stops}, but {config.denoiser} does not follow exposure "
+                "(f(s·x) is not s·f(x)), so its images in the cache cannot be rescaled: set it to 0."
+            )
+        tangents = config.loss == "sure" and config.sure_derivative == "probe"
+        method = build_method(config)
+        self.cache = EstimateCache(denoiser, method, cache_folder, tangents=tangents)
+        items = index(config.data, spp=config.spp, reference_spp=config.reference_spp)
+        training, held = split(items, share=config.held_out, scenes=config.held_out_scenes)
+        examples = data.load(
+            training + held,
+            variance_of=config.variance_of,
+            cache=self.cache,
+            draws=config.draws,
+            progress=progress,
+        )
+        if config.crop > min(examples.size):
+            raise ValueError(
+                f"crop is {config.crop}, but the images are {examples.size[1]}×{examples.size[0]} pixels."
+            )
+        count = len(training)
+        self.size = examples.size
+        self.items = examples.items[:count]
+        self.arrays = {name: array[:count] for name, array in examples.arrays.items()}
+        held_arrays = {name: array[count:] for name, array in examples.arrays.items()}
+        self.held_out = evaluation.HeldOut(examples.items[count:], held_arrays)
+
+    def init(self, key: jax.Array) -> Params:
+        return self.architecture.init(key)
+
+    def example(
+        self, arrays: Mapping[str, Array], index: Array, key: jax.Array
+    ) -> dict[str, Array]:
+        """One augmented example, with `swap` among its entries."""
+        draw_key, change_key, swap_key = jax.random.split(key, 3)
+        picked = {name: array[index] for name, array in arrays.items() if name != "divergence"}
+        which = jax.random.randint(draw_key, (), 0, self.config.draws)
+        picked["divergence"] = arrays["divergence"][index, which]
+        change = augment.draw(change_key, self.size, self.config)
+        changed = augment.apply(change, picked, crop=self.config.crop)
+        changed["swap"] = jax.random.bernoulli(swap_key, self.config.swap)
+        return changed
+
+    def loss(
+        self, params: Params, batch: Mapping[str, Float[Array, "b ..."]]
+    ) -> tuple[Array, dict[str, Array]]:
+        """The loss over a batch of examples, and curves to draw."""
+        x, y, variance = batch["color"], batch["denoised"], batch["variance"]
+
+        def mix(x: Array, y: Array, divergence: Array) -> Array:
+            risk = sure_of(x, y, variance, divergence)
+            swap = batch["swap"][:, None, None, None]
+            found = swapped_alpha(self.architecture, params, x, y, variance, divergence, risk, swap)
+            if self.config.bound:
+                found = jax.vmap(_bounded)(found, x, y, variance, batch["mean_variance"])
+            return found
+
+        if self.config.loss == "sure":
+            alpha, tangent = self._alpha_and_derivative(mix, batch)
+            risk = losses.mix_risk(alpha, x, y, variance, batch["divergence"], tangent)
+            loss = losses.relative_risk(risk, y).mean()
+        else:
+            alpha = mix(x, y, batch["divergence"])
+            z = x + alpha * (y - x)
+            loss = losses.SUPERVISED[self.config.loss](z, batch["reference"]).mean()
+        return loss, {"alpha": alpha.mean()}
+
+    def _alpha_and_derivative(
+        self, mix: Any, batch: Mapping[str, Array]
+    ) -> tuple[Array, Array | float]:
+        """α, and an estimate of σ²∂α/∂x by one probe through render, denoised image and SURE.
+
+        The denoiser's curvature is left out, so the divergence counts as constant: it is where a network of
+        ReLUs has no kink. So does the variance, which normal noise makes independent of the mean.
+        """
+        x, y, divergence = batch["color"], batch["denoised"], batch["divergence"]
+        if self.config.sure_derivative == "held":
+            return mix(x, y, divergence), 0.0
+        tangents = (batch["probe"], batch["tangent"], jnp.zeros_like(divergence))
+        alpha, along = jax.jvp(mix, (x, y, divergence), tangents)
+        return alpha, batch["probe"] * along
+
+    def evaluate(self, params: Params) -> evaluation.Scores:
+        """How the mixes compare on the held-out scenes, with the t-bound."""
+        return self.held_out.scores(NetworkMixer(params, self.architecture), self.config.score)
+
+    def export(self, path: os.PathLike[str], params: Params, metadata: Mapping[str, str]) -> None:
+        """Write weights that `progden denoise --mixer` takes."""
+        mixer = NetworkMixer(params, self.architecture)
+        save_mixer(path, mixer, denoiser=self.config.denoiser, **metadata)
+
+
+def swapped_alpha(
+    architecture: Architecture,
+    params: Params,
+    x: Array,
+    y: Array,
+    variance: Array,
+    divergence: Array,
+    risk: Array,
+    swap: Array,
+) -> Array:
+    """The weight of y; where `swap`, from the network asked for the weight of x in a mix from y on."""
+
+    def either(a: Array, b: Array) -> tuple[Array, Array]:
+        return jnp.where(swap, b, a), jnp.where(swap, a, b)
+
+    first, second = either(x, y)
+    first_risk, second_risk = either(variance, risk)
+    found = architecture.apply(params, first, second, first_risk, divergence, second_risk)
+    return jnp.where(swap, 1 - found, found)
+
+
+def sure_of(x: Array, y: Array, variance: Array, divergence: Array) -> Array:
+    """SURE of a batch of images."""
+    return sure(x, y, variance, divergence)
+
+
+def _bounded(alpha: Array, x: Array, y: Array, variance: Array, mean_variance: Array) -> Array:
+    return t_bound(alpha, x, y, variance, mean_variance=mean_variance)
+
+
+def build_method(config: MixerConfig) -> Method:
+    """The estimator of the divergence that the configuration names."""
+    if config.method not in METHODS:
+        raise ValueError(f"method is {config.method!r}, expected one of {', '.join(METHODS)}.")
+    return METHODS[config.method](config.probes)
+
+
+def follows_exposure(denoiser: Any) -> bool:
+    """Whether f(s·x) = s·f(x), but for the ends of half precision's range."""
+    return isinstance(denoiser, OIDN) and denoiser.exposure is None
