@@ -9,7 +9,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from flax.traverse_util import flatten_dict
 from jaxtyping import Array, Bool, Float
 
 from progden_jax import _safetensors
@@ -169,5 +168,5 @@ def _read(path: Path) -> NetworkMixer:
     return NetworkMixer(jax.tree.map(jnp.asarray, params), architecture, metadata=metadata)
 
 
-def _shapes(params: Any) -> dict[str, tuple[int, ...]]:
-    return {name: leaf.shape for name, leaf in flatten_dict(params, sep=".").items()}
+def _shapes(params: Any) -> Any:
+    return jax.tree.map(lambda leaf: leaf.shape, params)
