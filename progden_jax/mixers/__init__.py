@@ -1,20 +1,19 @@
 """Mixers: α in closed form or from a network, found by name or read from a file."""
 
 import dataclasses
+import functools
 import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
-import numpy as np
+from flax.traverse_util import flatten_dict
 from jaxtyping import Array, Bool, Float
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
 
-from progden_jax._files import replacing
+from progden_jax import _safetensors
 from progden_jax.mixers.architectures import ARCHITECTURES, Architecture, Params, build, name_of
 from progden_jax.mixing import ClosedForm, Mixer
 
@@ -36,7 +35,6 @@ CLOSED_FORM = "closed-form"
 
 _FOLDER = Path(__file__).parents[1] / "weights"
 _PREFIX = "mixer-"
-_SUFFIX = ".safetensors"
 
 
 @jax.tree_util.register_pytree_node_class
@@ -91,8 +89,11 @@ class NetworkMixer:
 
 def names() -> tuple[str, ...]:
     """The names that `load` knows: the closed form, and the denoisers that a mixer is shipped for."""
-    shipped = sorted(p.name for p in _FOLDER.glob(f"{_PREFIX}*{_SUFFIX}"))
-    return (CLOSED_FORM, *(n.removeprefix(_PREFIX).removesuffix(_SUFFIX) for n in shipped))
+    shipped = sorted(p.name for p in _FOLDER.glob(f"{_PREFIX}*{_safetensors.ENDING}"))
+    return (
+        CLOSED_FORM,
+        *(n.removeprefix(_PREFIX).removesuffix(_safetensors.ENDING) for n in shipped),
+    )
 
 
 def load(name: str | os.PathLike[str]) -> Mixer:
@@ -108,14 +109,15 @@ def load(name: str | os.PathLike[str]) -> Mixer:
         If there is no such name or file, or the file holds no mixer.
     """
     text = os.fspath(name)
-    if text.endswith(_SUFFIX):
+    if text.endswith(_safetensors.ENDING):
         return _read(Path(text))
     if text == CLOSED_FORM:
         return ClosedForm()
     if text in names():
-        return _read(_FOLDER / f"{_PREFIX}{text}{_SUFFIX}")
+        return _shipped(text)
     raise ValueError(
-        f"mixer is {text!r}, expected one of {', '.join(names())}, or a path that ends in {_SUFFIX}."
+        f"mixer is {text!r}, expected one of {', '.join(names())}, or a path that ends in "
+        f"{_safetensors.ENDING}."
     )
 
 
@@ -132,37 +134,36 @@ def save_mixer(
     dtype: str = "float32",
     **metadata: str,
 ) -> None:
-    """Write a mixer's weights and settings as safetensors; a file that exists is replaced whole or not at all.
+    """Write a mixer's weights and settings so that `load` gives it back; whole or not at all.
 
     Parameters
     ----------
+    path : ends in .safetensors.
     dtype : "float16" halves the file, at about three digits.
     metadata : what more to say of it, such as the denoiser it was trained for, added to the mixer's own.
+
+    Raises
+    ------
+    ValueError
+        If the path ends otherwise, or a weight is not finite in `dtype`.
     """
-    path = Path(path)
-    if path.suffix != _SUFFIX:
-        raise ValueError(f"a mixer's file must end in {_SUFFIX}, and this is {path}.")
     said = {
         **mixer.metadata,
         **metadata,
         "kind": "mixer",
         "architecture": name_of(mixer.architecture),
-        "options": json.dumps(dataclasses.asdict(mixer.architecture)),  # pyright: ignore[reportArgumentType]
+        "options": json.dumps(dataclasses.asdict(cast(Any, mixer.architecture))),
     }
-    tensors = {name: np.ascontiguousarray(a, dtype) for name, a in _flatten(mixer.params).items()}
-    with replacing(path) as temporary:
-        temporary.write_bytes(save(tensors, said))
+    _safetensors.write(path, mixer.params, said, dtype=dtype)
+
+
+@functools.lru_cache(maxsize=8)
+def _shipped(name: str) -> NetworkMixer:
+    return _read(_FOLDER / f"{_PREFIX}{name}{_safetensors.ENDING}")
 
 
 def _read(path: Path) -> NetworkMixer:
-    try:
-        with safe_open(path, "numpy") as file:
-            metadata = dict(file.metadata() or {})
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except FileNotFoundError:
-        raise ValueError(f"{path}: there is no such file.") from None
-    except (OSError, SafetensorError) as error:
-        raise ValueError(f"{path} is no safetensors file that can be read: {error}") from None
+    params, metadata = _safetensors.read(path)
     if metadata.get("kind") != "mixer":
         raise ValueError(
             f"{path} holds no mixer (its metadata says {metadata.get('kind', 'nothing')!r}): "
@@ -172,19 +173,11 @@ def _read(path: Path) -> NetworkMixer:
         architecture = build(metadata["architecture"], json.loads(metadata["options"]))
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: {error}") from None
-    expected = _flatten(jax.eval_shape(architecture.init, jax.random.key(0)))
-    if {k: v.shape for k, v in expected.items()} != {k: v.shape for k, v in tensors.items()}:
+    expected = jax.eval_shape(architecture.init, jax.random.key(0))
+    if _shapes(expected) != _shapes(params):
         raise ValueError(f"{path}: its tensors are not those of the architecture {architecture}.")
-    params: dict[str, Any] = {}
-    for name, tensor in tensors.items():
-        *groups, last = name.split(".")
-        place = params
-        for group in groups:
-            place = place.setdefault(group, {})
-        place[last] = jnp.asarray(tensor, jnp.float32)
     return NetworkMixer(params, architecture, metadata=metadata)
 
 
-def _flatten(params: Params) -> dict[str, Any]:
-    leaves = jax.tree_util.tree_flatten_with_path(params)[0]
-    return {".".join(str(key.key) for key in path): leaf for path, leaf in leaves}
+def _shapes(params: Params) -> dict[str, tuple[int, ...]]:
+    return {n: jnp.shape(cast(Any, a)) for n, a in flatten_dict(params, sep=".").items()}
