@@ -24,44 +24,49 @@ def convolve(inputs: Array, kernel: Array, *arguments: Any, **settings: Any) -> 
         and tuple(strides or (1, 1)) == (1, 1)
         and not dilated
         and settings.get("feature_group_count", 1) == 1
-        and settings.get("precision") is None
         and all(n % 2 for n in kernel.shape[:2])
     )
     if plain:
-        return same_convolution(inputs, kernel)
+        return same_convolution(inputs, kernel, settings.get("precision"))
     return lax.conv_general_dilated(inputs, kernel, *arguments, **settings)
 
 
-def _convolve(inputs: Array, kernel: Array) -> Array:
-    return lax.conv_general_dilated(inputs, kernel, (1, 1), "SAME", dimension_numbers=_LAYOUT)
+def _convolve(inputs: Array, kernel: Array, precision: Any) -> Array:
+    return lax.conv_general_dilated(
+        inputs, kernel, (1, 1), "SAME", dimension_numbers=_LAYOUT, precision=precision
+    )
 
 
-@jax.custom_jvp
+@functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
 def same_convolution(
-    inputs: Float[Array, "n h w ci"], kernel: Float[Array, "kh kw ci co"]
+    inputs: Float[Array, "n h w ci"],
+    kernel: Float[Array, "kh kw ci co"],
+    precision: lax.PrecisionLike = None,
 ) -> Float[Array, "n h w co"]:
     """Convolution with zero padding to the same size; kernel sides must be odd.
 
     XLA makes the derivative by the kernel a convolution with a kernel as large as the image, which runs on
     CPUs at a fifth to a tenth of the forward pass's speed. There it is matrix products here.
     """
-    return _convolve(inputs, kernel)
+    return _convolve(inputs, kernel, precision)
 
 
 @functools.partial(same_convolution.defjvp, symbolic_zeros=True)
-def _jvp(primals: tuple[Array, Array], tangents: tuple[Any, Any]) -> tuple[Array, Array]:
+def _jvp(
+    precision: Any, primals: tuple[Array, Array], tangents: tuple[Any, Any]
+) -> tuple[Array, Array]:
     (inputs, kernel), (by_inputs, by_kernel) = primals, tangents
-    out = same_convolution(inputs, kernel)
+    out = same_convolution(inputs, kernel, precision)
     slope = jnp.zeros_like(out)
     if not isinstance(by_inputs, SymbolicZero):
-        slope = slope + same_convolution(by_inputs, kernel)
+        slope = slope + same_convolution(by_inputs, kernel, precision)
     if not isinstance(by_kernel, SymbolicZero):
         along = _by_products if jax.default_backend() == "cpu" else _convolve
-        slope = slope + along(inputs, by_kernel)
+        slope = slope + along(inputs, by_kernel, precision)
     return out, slope
 
 
-def _by_products(inputs: Array, kernel: Array) -> Array:
+def _by_products(inputs: Array, kernel: Array, precision: Any) -> Array:
     """The convolution again, in a form whose transpose by the kernel is a few products per strip of rows."""
     (kh, kw, ci, co), (n, h, w, _) = kernel.shape, inputs.shape
     height = max(d for d in range(1, h + 1) if h % d == 0 and d * w <= max(w, _STRIP))
@@ -82,7 +87,10 @@ def _by_products(inputs: Array, kernel: Array) -> Array:
         else:
             wide = jnp.concatenate([rows[:, j : j + w] for j in range(kw)], axis=-1)
             columns = [wide[i : i + height] for i in range(kh)]
-        flat = sum(c.reshape(height * w, -1) @ b for c, b in zip(columns, blocks, strict=True))
+        flat = sum(
+            jnp.matmul(c.reshape(height * w, -1), b, precision=precision)
+            for c, b in zip(columns, blocks, strict=True)
+        )
         return jnp.reshape(flat, (height, w, co))
 
     return lax.map(lambda strip: one(strip, blocks), jnp.arange(n * strips)).reshape(n, h, w, co)

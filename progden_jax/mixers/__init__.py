@@ -1,14 +1,16 @@
 """Mixers: α in closed form or from a network, found by name or read from a file."""
 
 import dataclasses
+import functools
 import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
+from flax.traverse_util import flatten_dict
 from jaxtyping import Array, Bool, Float
 
 from progden_jax import _safetensors
@@ -33,7 +35,6 @@ CLOSED_FORM = "closed-form"
 
 _FOLDER = Path(__file__).parents[1] / "weights"
 _PREFIX = "mixer-"
-_SUFFIX = _safetensors.ENDING
 
 
 @jax.tree_util.register_pytree_node_class
@@ -88,8 +89,11 @@ class NetworkMixer:
 
 def names() -> tuple[str, ...]:
     """The names that `load` knows: the closed form, and the denoisers that a mixer is shipped for."""
-    shipped = sorted(p.name for p in _FOLDER.glob(f"{_PREFIX}*{_SUFFIX}"))
-    return (CLOSED_FORM, *(n.removeprefix(_PREFIX).removesuffix(_SUFFIX) for n in shipped))
+    shipped = sorted(p.name for p in _FOLDER.glob(f"{_PREFIX}*{_safetensors.ENDING}"))
+    return (
+        CLOSED_FORM,
+        *(n.removeprefix(_PREFIX).removesuffix(_safetensors.ENDING) for n in shipped),
+    )
 
 
 def load(name: str | os.PathLike[str]) -> Mixer:
@@ -105,14 +109,15 @@ def load(name: str | os.PathLike[str]) -> Mixer:
         If there is no such name or file, or the file holds no mixer.
     """
     text = os.fspath(name)
-    if text.endswith(_SUFFIX):
+    if text.endswith(_safetensors.ENDING):
         return _read(Path(text))
     if text == CLOSED_FORM:
         return ClosedForm()
     if text in names():
-        return _read(_FOLDER / f"{_PREFIX}{text}{_SUFFIX}")
+        return _shipped(text)
     raise ValueError(
-        f"mixer is {text!r}, expected one of {', '.join(names())}, or a path that ends in {_SUFFIX}."
+        f"mixer is {text!r}, expected one of {', '.join(names())}, or a path that ends in "
+        f"{_safetensors.ENDING}."
     )
 
 
@@ -129,26 +134,32 @@ def save_mixer(
     dtype: str = "float32",
     **metadata: str,
 ) -> None:
-    """Write a mixer's weights and settings as safetensors, whole or not at all.
+    """Write a mixer's weights and settings so that `load` gives it back; whole or not at all.
 
     Parameters
     ----------
+    path : ends in .safetensors.
     dtype : "float16" halves the file, at about three digits.
     metadata : what more to say of it, such as the denoiser it was trained for, added to the mixer's own.
 
     Raises
     ------
     ValueError
-        If the path does not end in .safetensors, or a weight is not finite in that type.
+        If the path ends otherwise, or a weight is not finite in `dtype`.
     """
     said = {
         **mixer.metadata,
         **metadata,
         "kind": "mixer",
         "architecture": name_of(mixer.architecture),
-        "options": json.dumps(dataclasses.asdict(mixer.architecture)),  # pyright: ignore[reportArgumentType]
+        "options": json.dumps(dataclasses.asdict(cast(Any, mixer.architecture))),
     }
     _safetensors.write(path, mixer.params, said, dtype=dtype)
+
+
+@functools.lru_cache(maxsize=8)
+def _shipped(name: str) -> NetworkMixer:
+    return _read(_FOLDER / f"{_PREFIX}{name}{_safetensors.ENDING}")
 
 
 def _read(path: Path) -> NetworkMixer:
@@ -165,8 +176,8 @@ def _read(path: Path) -> NetworkMixer:
     expected = jax.eval_shape(architecture.init, jax.random.key(0))
     if _shapes(expected) != _shapes(params):
         raise ValueError(f"{path}: its tensors are not those of the architecture {architecture}.")
-    return NetworkMixer(jax.tree.map(jnp.asarray, params), architecture, metadata=metadata)
+    return NetworkMixer(params, architecture, metadata=metadata)
 
 
-def _shapes(params: Any) -> Any:
-    return jax.tree.map(lambda leaf: leaf.shape, params)
+def _shapes(params: Params) -> dict[str, tuple[int, ...]]:
+    return {n: jnp.shape(cast(Any, a)) for n, a in flatten_dict(params, sep=".").items()}

@@ -1,46 +1,18 @@
 """What a learned mixer can look like: features and network, by name."""
 
 import dataclasses
+import math
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from progden_jax import _checks
+from progden_jax.mixers._base import Architecture, Params
+from progden_jax.mixers.multiscale import Multiscale
 from progden_jax.mixing import FEATURES, MixingNet, mixing_features
-
-Params = Mapping[str, Any]
-"""Nested names -> arrays."""
-
-
-class Architecture(Protocol):
-    """A frozen, hashable dataclass of settings that turns weights and what is known of an image into α.
-
-    Training calls it with (x, σ²) and (y, SURE) swapped in half of the cases (paper, section 4.3): it must
-    then give the weight of x in a mix that starts from y. The closed form has that property, for its
-    numerator becomes SURE − divergence; so anything built on the same quantities has it.
-    Leading axes of the images are a batch.
-    """
-
-    def init(self, key: jax.Array) -> Params:
-        """Weights to start training from."""
-        ...
-
-    def apply(
-        self,
-        params: Params,
-        x: Float[Array, "*b h w 3"],
-        y: Float[Array, "*b h w 3"],
-        variance: Float[Array, "*b h w 3"],
-        divergence: Float[Array, "*b h w 3"],
-        sure: Float[Array, "*b h w 3"],
-        *,
-        inside: Bool[Array, "h w 1"] | None = None,
-    ) -> Float[Array, "*b h w 3"]:
-        """α in [0, 1]; as if the image ended where `inside` is False."""
-        ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,14 +37,15 @@ class Paper:
         _checks.choice("space", self.space, ("linear", "log"))
 
     def init(self, key: jax.Array) -> Params:
-        """Flax's defaults, with biases of the last layer such that f_act starts where it has a slope.
+        """He's random kernels and zero biases; the last layer's are such that f_act begins with a slope.
 
         From biases of zero x3 is negative in half of all pixels, and there f_act is a step.
         """
-        params = self._net.init(key, jnp.zeros((1, 8, 8, FEATURES)))["params"]
+        form = jax.eval_shape(self._net.init, key, jnp.zeros((1, 8, 8, FEATURES)))["params"]
+        params = he_normal(key, form)
         if self.ratio:
             start = jnp.repeat(jnp.asarray([0.5, 0.0, 1.0]), 3)
-            params = {**params, "conv_out": {**params["conv_out"], "bias": start}}
+            params["conv_out"] = {"kernel": 0.1 * params["conv_out"]["kernel"], "bias": start}
         return params
 
     def apply(
@@ -100,6 +73,23 @@ class Paper:
         return MixingNet(width=self.width, ratio=self.ratio)
 
 
+def he_normal(key: jax.Array, form: Params) -> dict[str, dict[str, Array]]:
+    """Layers of these shapes: kernels normal with variance 2 / fan-in, biases zero.
+
+    All numbers come from one draw, which compiles several times faster than one per layer.
+    """
+    sizes = {name: math.prod(layer["kernel"].shape) for name, layer in form.items()}
+    numbers = jax.random.normal(key, (sum(sizes.values()),))
+    params, start = {}, 0
+    for name, layer in form.items():
+        shape = layer["kernel"].shape
+        kernel = numbers[start : start + sizes[name]].reshape(shape)
+        start += sizes[name]
+        scale = math.sqrt(2 / math.prod(shape[:-1]))
+        params[name] = {"kernel": scale * kernel, "bias": jnp.zeros(layer["bias"].shape)}
+    return params
+
+
 def from_log_weight(
     alpha: Float[Array, "*b h w 3"], x: Float[Array, "*b h w 3"], y: Float[Array, "*b h w 3"]
 ) -> Float[Array, "*b h w 3"]:
@@ -113,7 +103,7 @@ def from_log_weight(
     return jnp.where(small, alpha, jnp.expm1(alpha * safe) / jnp.expm1(safe))
 
 
-ARCHITECTURES: dict[str, type] = {"paper": Paper}
+ARCHITECTURES: dict[str, type] = {"paper": Paper, "multiscale": Multiscale}
 """Names in configurations and weights files."""
 
 

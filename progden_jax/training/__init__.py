@@ -4,7 +4,7 @@ Needs the extra `train`: pip install 'progden_jax[train]'.
 """
 
 from progden_jax.training.config import DenoiserConfig, MixerConfig, RunConfig
-from progden_jax.training.loop import Outcome, Report, train
+from progden_jax.training.loop import Outcome, Report, Trainer, train
 from progden_jax.training.mixer_task import MixerTask
 from progden_jax.training.step import State, Task
 
@@ -17,5 +17,6 @@ __all__ = [
     "RunConfig",
     "State",
     "Task",
+    "Trainer",
     "train",
 ]

@@ -37,7 +37,8 @@ _RADIANCE_POWER = {
 """By what power of s a buffer grows when radiance grows by s; buffers not listed do not."""
 
 _UNCOLORED = ("normal", "depth", "mean_variance")
-_ORDERS = np.asarray([(0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)])
+ORDERS = np.asarray([(0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)])
+"""Orders of the colour channels, the unchanged one first."""
 
 
 class Change(NamedTuple):
@@ -66,7 +67,7 @@ def draw(key: jax.Array, size: tuple[int, int], config: RunConfig) -> Change:
     # Without mirroring the eight symmetries of the square are cut to the four turns.
     turned = jnp.logical_xor(flip_rows, transpose)
     flip_columns = coins[2] if config.flips else turned if config.turns else none
-    order = jax.random.randint(keys[5], (), 0, len(_ORDERS)) if config.permute_colors else 0
+    order = jax.random.randint(keys[5], (), 0, len(ORDERS)) if config.permute_colors else 0
     stops = config.exposure_stops * jax.random.uniform(keys[6], minval=-1, maxval=1)
     return Change(row, column, transpose, flip_rows, flip_columns, jnp.asarray(order), stops)
 
@@ -86,6 +87,6 @@ def _apply(change: Change, name: str, buffer: Array, crop: int) -> Array:
         buffer = jnp.where(change.flip_rows, buffer[::-1], buffer)
         buffer = jnp.where(change.flip_columns, buffer[:, ::-1], buffer)
         if name not in _UNCOLORED:
-            buffer = jnp.take(buffer, jnp.asarray(_ORDERS)[change.order], axis=-1)
+            buffer = jnp.take(buffer, jnp.asarray(ORDERS)[change.order], axis=-1)
     power = _RADIANCE_POWER.get(name, 0)
     return buffer * jnp.exp2(power * change.stops) if power else buffer

@@ -43,16 +43,19 @@ class Checkpoints:
         """Write the state; one of the same step counts as written."""
         step = int(state.step)
         if step not in self._manager.all_steps():
-            self._manager.save(step, args=self._ocp.args.StandardSave(state._asdict()))
+            self._manager.save(step, args=self._ocp.args.StandardSave(_named(state)))
 
     def restore(self, like: State) -> State | None:
         """The latest state, or None; `like` gives its form."""
         step = self._manager.latest_step()
         if step is None:
             return None
-        form = jax.eval_shape(lambda: like._asdict())
-        form = jax.tree.map(lambda a, b: a.update(sharding=b.sharding), form, like._asdict())
-        return State(**self._manager.restore(step, args=self._ocp.args.StandardRestore(form)))
+        form = {
+            name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=leaf.sharding)
+            for name, leaf in _named(like).items()
+        }
+        leaves = self._manager.restore(step, args=self._ocp.args.StandardRestore(form))
+        return jax.tree.unflatten(jax.tree.structure(like), [leaves[name] for name in form])
 
     def __enter__(self) -> "Checkpoints":
         return self
@@ -66,9 +69,14 @@ class Checkpoints:
         self._manager.close()
 
 
+def _named(state: State) -> dict[str, jax.Array]:
+    """The leaves under numbers: weights may be held in classes that orbax does not know."""
+    return {f"{n:04}": leaf for n, leaf in enumerate(jax.tree.leaves(state))}
+
+
 def describe(kind: str, config: RunConfig, items: Any) -> dict[str, Any]:
     """What a run is made of, as plain JSON."""
-    fields = {k: _plain(v) for k, v in vars(config).items()}
+    fields = plain(config)
     files = [(item.scene, item.spp, item.path.stat().st_size) for item in items]
     digest = hashlib.blake2b(repr(files).encode(), digest_size=8).hexdigest()
     fields.pop("data")
@@ -103,7 +111,12 @@ def claim(folder: Path, description: dict[str, Any]) -> None:
         )
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, tuple):
-        return list(value)
-    return dict(value) if hasattr(value, "items") else value
+def plain(config: RunConfig) -> dict[str, Any]:
+    """The configuration as plain JSON."""
+
+    def one(value: Any) -> Any:
+        if isinstance(value, tuple):
+            return list(value)
+        return dict(value) if hasattr(value, "items") else value
+
+    return {name: one(value) for name, value in vars(config).items()}

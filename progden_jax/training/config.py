@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from progden_jax import _checks
+from progden_jax.training.losses import SUPERVISED
 
 Meaning = Literal["mean", "samples", "std", "second-moment"]
 """What variance channels hold, see `progden_jax.read_exr`."""
@@ -35,7 +36,7 @@ class RunConfig:
     turns: bool = True  # turn crops by random quarters
     permute_colors: bool = True  # random order of red, green and blue
     exposure_stops: float = 0.0  # radiance times 2^u, u uniform between minus and plus this
-    loss: str = "smape"  # smape, relmse, l1, logl1, or sure (no reference needed)
+    loss: str = "smape"  # smape, relmse, l1, logl1, log-errors, or sure (no reference needed)
     peak_rate: float = 1e-3  # highest learning rate of the cycle
     warmup: float = 0.3  # share of steps until the peak
     start_divisor: float = 25.0  # first rate: the peak over this
@@ -62,7 +63,7 @@ class RunConfig:
             _within(self, name, 0, 2**32, "a whole number from 0 up")
         for name in ("peak_rate", "start_divisor", "end_divisor"):
             _within(self, name, 0, float("inf"), "a number above 0", closed=False)
-        _checks.choice("loss", self.loss, ("smape", "relmse", "l1", "logl1", "sure"))
+        _checks.choice("loss", self.loss, (*SUPERVISED, "log-errors", "sure"))
         _checks.choice("precision", self.precision, ("default", "high", "highest"))
 
 

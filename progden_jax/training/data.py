@@ -94,7 +94,8 @@ def _repaired(item: Item, variance_of: Meaning, *, reference: bool = False) -> p
     if reference:
         frame = pd.read_exr(item.reference, auxiliary=False).replace(variance=None, spp=None)
     else:
-        frame = pd.read_exr(item.path, variance_of=variance_of).replace(spp=None)
+        given = None if variance_of == "mean" else variance_of
+        frame = pd.read_exr(item.path, variance_of=given).replace(spp=None)
         if frame.variance is None:
             raise ValueError(
                 f"{item.path} has no variance, and training needs that of the sample mean."

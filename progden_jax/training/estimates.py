@@ -50,7 +50,8 @@ class EstimateCache:
     ----------
     denoiser, method : what estimates.
     folder : where to keep them, made if missing; by default `default_folder()`. Entries that are damaged
-        are computed again. It may be deleted at any time.
+        are computed again. It may be deleted at any time. Nothing is kept for a denoiser that is a Python
+        function, which cannot be told from another in the next process.
     tangents : also a probe and the denoiser's derivative along it, a third of the cost more.
     """
 
@@ -68,6 +69,7 @@ class EstimateCache:
         self._method = method
         self._fields = Estimate._fields if tangents else Estimate._fields[:2]
         kind, structure = type(denoiser).__qualname__, str(jax.tree.structure(denoiser))
+        self.stores = " at 0x" not in structure
         self._settings = _digest(_VERSION, kind, structure, repr(method), self._fields)
         for leaf in jax.tree.leaves(denoiser):
             self._settings = _digest(self._settings, np.asarray(leaf))
@@ -80,7 +82,7 @@ class EstimateCache:
     def get(self, frame: Frame, seed: int = 0) -> Estimate:
         """The estimate for a repaired frame; `seed` is of the random probes."""
         path = self.folder / f"{self.key(frame, seed)}.safetensors"
-        found = self._read(path, frame.color.shape)
+        found = self._read(path, frame.color.shape) if self.stores else None
         if found is not None:
             self.hits += 1
             return found
@@ -88,9 +90,10 @@ class EstimateCache:
         key, tangents = jax.random.key(seed), len(self._fields) > 2
         made = _estimate(frame, self._denoiser, key, method=self._method, tangents=tangents)
         arrays = {name: np.asarray(a) for name, a in zip(self._fields, made, strict=True)}
-        self.folder.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as temporary:
-            temporary.write_bytes(save(arrays, {"digest": _digest(*arrays.values())}))
+        if self.stores:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with replacing(path) as temporary:
+                temporary.write_bytes(save(arrays, {"digest": _digest(*arrays.values())}))
         return Estimate(**arrays)
 
     def _read(self, path: Path, shape: tuple[int, ...]) -> Estimate | None:

@@ -1,5 +1,6 @@
 """How mixers compare on scenes held out of training, beside what they must beat and cannot reach."""
 
+import functools
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -67,7 +68,10 @@ class HeldOut:
         names = ("color", "denoised", "variance", "divergence", "reference")
         self._arrays = {name: jnp.asarray(arrays[name]) for name in names}
         self._arrays["divergence"] = self._arrays["divergence"][:, 0]
-        self._baselines = {k: np.asarray(v) for k, v in _baseline_errors(self._arrays).items()}
+
+    @functools.cached_property
+    def _baselines(self) -> dict[str, np.ndarray]:
+        return {name: np.asarray(v) for name, v in _baseline_errors(self._arrays).items()}
 
     def scores(self, mixer: Mixer, score: str = "balanced") -> Scores:
         """Means over scenes per spp. The score is of ratios to the denoiser's errors, per render.

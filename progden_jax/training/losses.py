@@ -29,6 +29,32 @@ def logl1(z: Float[Array, "..."], reference: Float[Array, "..."]) -> Float[Array
     return jnp.abs(jnp.log1p(jnp.maximum(z, 0)) - jnp.log1p(jnp.maximum(reference, 0)))
 
 
+def log_errors(
+    z: Float[Array, "*b h w 3"],
+    x: Float[Array, "*b h w 3"],
+    y: Float[Array, "*b h w 3"],
+    reference: Float[Array, "*b h w 3"],
+) -> Float[Array, "*b"]:
+    """log SMAPE + log RMSE of each image: one percent off either counts the same, in easy images and hard ones.
+
+    A small share of the lesser error of x and y is added, so that an image that is nearly right does not
+    outweigh all others.
+    """
+
+    def both(image: Array) -> tuple[Array, Array]:
+        axes = (-3, -2, -1)
+        return smape(image, reference).mean(axes), ((image - reference) ** 2).mean(axes)
+
+    relative, squared = both(z)
+    least_relative, least_squared = (
+        jnp.minimum(a, b) for a, b in zip(both(x), both(y), strict=True)
+    )
+    tiny = jnp.finfo(z.dtype).tiny
+    return jnp.log(relative + 0.05 * least_relative + 1e-6) + 0.5 * jnp.log(
+        squared + 0.02 * least_squared + tiny
+    )
+
+
 SUPERVISED: dict[str, Loss] = {"smape": smape, "relmse": relmse, "l1": l1, "logl1": logl1}
 """Losses against a reference, by their names in configurations."""
 

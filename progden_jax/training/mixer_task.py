@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from progden_jax import denoisers
-from progden_jax.denoisers import OIDN
+from progden_jax.denoisers import OIDN, Denoiser
 from progden_jax.divergence import Exact, FiniteDifference, Method, MonteCarlo, Probing
 from progden_jax.mixers import NetworkMixer, build, save_mixer
 from progden_jax.mixers.architectures import Architecture, Params
@@ -36,6 +36,7 @@ class MixerTask:
     Parameters
     ----------
     config : what to train on and how; `config.data` names the folders.
+    denoiser : instead of loading the one that the configuration names.
     cache_folder : of denoised images and divergences, by default `estimates.default_folder()`.
     progress : called with how many of how many renders are loaded.
 
@@ -51,12 +52,14 @@ class MixerTask:
         self,
         config: MixerConfig,
         *,
+        denoiser: Denoiser | None = None,
         cache_folder: str | os.PathLike[str] | None = None,
         progress: data.Progress = lambda done, total: None,
     ) -> None:
         self.config = config
         self.architecture = build(config.architecture, config.options)
-        denoiser = denoisers.load(config.denoiser)
+        if denoiser is None:
+            denoiser = denoisers.load(config.denoiser)
         if config.exposure_stops and not follows_exposure(denoiser):
             raise ValueError(
                 f"exposure_stops is {config.exposure_stops}, but {config.denoiser} does not follow exposure "
@@ -122,7 +125,10 @@ class MixerTask:
         else:
             alpha = mix(x, y, batch["divergence"])
             z = x + alpha * (y - x)
-            loss = losses.SUPERVISED[self.config.loss](z, batch["reference"]).mean()
+            if self.config.loss == "log-errors":
+                loss = losses.log_errors(z, x, y, batch["reference"]).mean()
+            else:
+                loss = losses.SUPERVISED[self.config.loss](z, batch["reference"]).mean()
         return loss, {"alpha": alpha.mean()}
 
     def _alpha_and_derivative(

@@ -19,7 +19,11 @@ class Task(Protocol):
     kind: str
     config: Any
     items: Any
-    arrays: Mapping[str, Any]
+
+    @property
+    def arrays(self) -> Mapping[str, Any]:
+        """Buffer name -> (N, ...)."""
+        ...
 
     def init(self, key: jax.Array) -> Any:
         """Weights to start from."""
@@ -82,23 +86,22 @@ def optimizer(config: RunConfig) -> optax.GradientTransformation:
 
 def initial_state(task: Task) -> State:
     """The state at step 0."""
-    params = task.init(jax.random.key(task.config.seed))
-    params = jax.tree.map(jnp.asarray, params)
 
-    def copy() -> Any:
-        return jax.tree.map(jnp.copy, params)  # each is donated on its own
+    def make(key: Array) -> State:
+        params = task.init(key)
+        zero = jnp.zeros((), jnp.int32)
+        return State(
+            step=zero,
+            params=params,
+            optimizer=optimizer(task.config).init(params),
+            average=params,
+            best=params,
+            best_score=jnp.asarray(jnp.inf, jnp.float32),
+            best_step=zero,
+            stale=zero,
+        )
 
-    zero = [jnp.zeros((), jnp.int32) for _ in range(3)]
-    return State(
-        step=zero[0],
-        params=params,
-        optimizer=optimizer(task.config).init(params),
-        average=copy(),
-        best=copy(),
-        best_score=jnp.asarray(jnp.inf, jnp.float32),
-        best_step=zero[1],
-        stale=zero[2],
-    )
+    return jax.jit(make)(jax.random.key(task.config.seed))
 
 
 Step = Callable[[State, Mapping[str, Array], Array, Array], tuple[State, dict[str, Array]]]
@@ -111,17 +114,18 @@ def make_step(task: Task, mesh: Mesh | None = None) -> Step:
     """
     config, transform = task.config, optimizer(task.config)
 
-    def gradient(params: Any, arrays: Any, keys: Array, indices: Array) -> Any:
+    def local(params: Any, arrays: Any, keys: Array, indices: Array) -> Any:
         batch = jax.vmap(task.example, (None, 0, 0))(arrays, indices, keys)
         return jax.value_and_grad(task.loss, has_aux=True)(params, batch)
 
     def shared(params: Any, arrays: Any, keys: Array, indices: Array) -> Any:
-        return jax.lax.pmean(gradient(params, arrays, keys, indices), "batch")
+        return jax.lax.pmean(local(params, arrays, keys, indices), "batch")
 
+    gradient = local
     if mesh is not None:
         split, whole = PartitionSpec("batch"), PartitionSpec()
         gradient = jax.shard_map(
-            shared if mesh.size > 1 else gradient,
+            shared,
             mesh=mesh,
             in_specs=(whole, whole, split, split),
             out_specs=whole,

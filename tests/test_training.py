@@ -1,0 +1,584 @@
+"""Training: configurations, data, cache, augmentation, the loop and its resumption."""
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import counting_compilations
+from jax.sharding import Mesh
+
+import progden_jax as pd
+from progden_jax import mixers
+from progden_jax.cli import main
+from progden_jax.training import MixerConfig, MixerTask, Trainer, config, losses, order, train
+from progden_jax.training import augment as augmenting
+from progden_jax.training.estimates import EstimateCache
+from progden_jax.training.index import index, split
+from progden_jax.training.mixer_task import swapped_alpha
+from progden_jax.training.step import initial_state, make_step
+
+SIZE = 24
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Blur:
+    """A denoiser that halves the distance to the mean of the four neighbours, times a gain."""
+
+    gain: float = 1.0
+
+    def __call__(self, frame: pd.Frame) -> jax.Array:
+        return self.bind(frame)(frame.color)
+
+    def bind(self, frame: pd.Frame) -> jax.tree_util.Partial:
+        del frame
+        return jax.tree_util.Partial(_blurred, self.gain)
+
+
+def _blurred(gain, x):
+    around = sum(jnp.roll(x, s, a) for s in (1, -1) for a in (0, 1)) / 4
+    return gain * (x + around) / 2
+
+
+def _write_series(folder: Path, scene: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth = rng.random((4, 4, 3)).repeat(SIZE // 4, 0).repeat(SIZE // 4, 1)
+    for spp in (4, 64):
+        variance = truth / spp
+        color = truth + np.sqrt(variance) * rng.normal(size=truth.shape)
+        frame = pd.Frame(color.astype(np.float32), variance.astype(np.float32))
+        pd.write_exr(folder / f"{scene}_{spp:06}spp.exr", frame)
+    pd.write_exr(folder / f"{scene}_004096spp.exr", truth.astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    made = tmp_path_factory.mktemp("renders")
+    for seed, scene in enumerate(("one", "two", "three")):
+        _write_series(made, scene, seed)
+    return made
+
+
+def _config(folder: Path, **changes) -> MixerConfig:
+    values = {"data": [str(folder)], "crop": 16, "held_out_scenes": ["two"], **changes}
+    return config.load(MixerConfig, "smoke", values)
+
+
+@pytest.fixture(scope="module")
+def trainer(folder, tmp_path_factory) -> Trainer:
+    cache = tmp_path_factory.mktemp("cache")
+    chosen = _config(folder, options={"width": 4})
+    return Trainer(MixerTask(chosen, denoiser=Blur(), cache_folder=cache))
+
+
+@pytest.fixture(scope="module")
+def whole(trainer, tmp_path_factory):
+    """The outcome of an uninterrupted run, its folder, and what was compiled during steps 4 to 6."""
+    where = tmp_path_factory.mktemp("whole")
+
+    class Report:
+        compiled = None
+
+        def started(self, step, steps):
+            assert (step, steps) == (0, 6)
+
+        def stepped(self, step, values):
+            assert (values is None) == (step % trainer.task.config.log_every != 0)
+            if step == 3:
+                self.listening = counting_compilations()
+                self.names = self.listening.__enter__()
+            if step == 5:
+                self.compiled = list(self.names)
+                self.listening.__exit__(None, None, None)
+
+        def evaluated(self, step, scores, *, best):
+            assert step in (3, 6)
+
+    report = Report()
+    return trainer.run(where, report=report), where, report
+
+
+def test_a_run_changes_the_weights_and_compiles_once(trainer, whole):
+    outcome, where, report = whole
+    start = trainer.task.init(jax.random.key(trainer.task.config.seed))
+    assert int(outcome.state.step) == 6
+    changed = jax.tree.map(lambda a, b: bool((a != b).any()), start, outcome.state.params)
+    assert all(jax.tree.leaves(changed))
+    assert not {"step", "train_step"} & set(report.compiled)
+    lines = [json.loads(line) for line in (where / "curves.jsonl").read_text().splitlines()]
+    losses_seen = [line["train/loss"] for line in lines if "train/loss" in line]
+    assert len(losses_seen) == 6
+    assert all(0 < value < 1 for value in losses_seen)
+    assert list((where / "tensorboard").iterdir())
+
+
+def test_resumption_is_exact(trainer, whole, tmp_path):
+    """Three steps, a kill after a fourth that no checkpoint knows, then the rest: bit for bit the same."""
+
+    class Killed(Exception):
+        pass
+
+    class Killer:
+        def started(self, step, steps): ...
+
+        def stepped(self, step, values):
+            if step == 4:
+                raise Killed
+
+        def evaluated(self, step, scores, *, best): ...
+
+    with pytest.raises(Killed):
+        trainer.run(tmp_path, report=Killer())
+    resumed = trainer.run(tmp_path)
+    outcome, where, _ = whole
+    for one, other in zip(
+        jax.tree.leaves(outcome.state), jax.tree.leaves(resumed.state), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
+    curves = [
+        [
+            {k: v for k, v in json.loads(line).items() if "seconds" not in k}
+            for line in (f / "curves.jsonl").read_text().splitlines()
+        ]
+        for f in (where, tmp_path)
+    ]
+    assert curves[0] == curves[1]
+    ours, theirs = (mixers.load(f / "weights.safetensors") for f in (where, tmp_path))
+    jax.tree.map(np.testing.assert_array_equal, ours.params, theirs.params)
+
+
+def test_a_folder_belongs_to_one_run(whole, folder, tmp_path):
+    _, where, _ = whole
+    other = MixerTask(
+        _config(folder, options={"width": 4}, peak_rate=0.1), denoiser=Blur(), cache_folder=tmp_path
+    )
+    with pytest.raises(ValueError, match=r"other settings \(peak_rate is 0\.1 and was 0\.001\)"):
+        train(other, where)
+
+
+def test_weights_are_the_best_and_say_where_they_come_from(trainer, whole):
+    outcome, _, _ = whole
+    mixer = mixers.load(outcome.weights)
+    jax.tree.map(np.testing.assert_array_equal, mixer.params, outcome.state.best)
+    assert mixer.metadata["denoiser"] == "oidn-hdr"
+    assert mixer.metadata["architecture"] == "paper"
+    assert int(mixer.metadata["steps"]) == int(outcome.state.best_step)
+    assert json.loads(mixer.metadata["config"])["steps"] == 6
+    assert mixer.metadata["commit"]
+    scores = trainer.task.evaluate(outcome.state.best)
+    np.testing.assert_allclose(scores.score, outcome.state.best_score, rtol=1e-6)
+    assert set(scores.table) == {"render", "denoised", "closed-form", "oracle", "mix"}
+    assert set(scores.table["oracle"]["rmse"]) == {4, 64}
+    for spp in (4, 64):
+        least = min(scores.table[name]["rmse"][spp] for name in ("render", "denoised"))
+        assert scores.table["oracle"]["rmse"][spp] <= 1.001 * least
+    assert f"mix/rmse/{4}spp" in scores.flat()
+
+
+def test_an_exhausted_patience_stops(trainer, whole, tmp_path, monkeypatch):
+    task = trainer.task
+    scores = task.evaluate(whole[0].state.best)
+    monkeypatch.setattr(task, "evaluate", lambda params: scores)
+    often = dataclasses.replace(task.config, patience=1, evaluate_every=1)
+    monkeypatch.setattr(task, "config", often)
+    outcome = trainer.run(tmp_path)
+    assert outcome.stopped_early
+    assert (int(outcome.state.step), int(outcome.state.best_step)) == (2, 1)
+
+
+def test_order_visits_every_example_once_an_epoch():
+    seen = [order.indices(step, count=10, batch=4, seed=3) for step in range(5)]
+    first, second = np.concatenate(seen)[:10], np.concatenate(seen)[10:]
+    assert sorted(first) == sorted(second) == list(range(10))
+    assert list(first) != list(second)
+    np.testing.assert_array_equal(order.indices(3, count=10, batch=4, seed=3), seen[3])
+
+
+def test_augmentation_is_consistent():
+    """SURE of the changed example is the changed SURE; all eight symmetries occur; normals keep values."""
+    rng = np.random.default_rng(0)
+    names = ("color", "denoised", "variance", "divergence", "reference", "albedo", "normal")
+    example = {n: rng.random((6, 6, 3), np.float32) for n in names}
+    example["mean_variance"] = np.float32(0.5)
+    sure = pd.sure(*(example[n] for n in ("color", "denoised", "variance", "divergence")))
+    keys = jax.random.split(jax.random.key(0), 200)
+    chosen = MixerConfig(steps=1, crop=4, exposure_stops=2.0)
+
+    @jax.jit
+    @jax.vmap
+    def changed(key):
+        change = augmenting.draw(key, (6, 6), chosen)
+        # SURE is of squared radiance, as the variance is.
+        moved = augmenting.apply(change, {"variance": sure}, crop=4)["variance"]
+        return change, augmenting.apply(change, example, crop=4), moved
+
+    change, many, moved = jax.tree.map(np.asarray, changed(keys))
+    again = pd.sure(*(many[n] for n in ("color", "denoised", "variance", "divergence")))
+    np.testing.assert_allclose(again, moved, rtol=1e-4, atol=1e-5)
+    scale = np.exp2(change.stops)
+    assert scale.min() < 0.3
+    assert scale.max() > 3
+    np.testing.assert_allclose(many["mean_variance"], 0.5 * scale**2, rtol=1e-5)
+    assert many["albedo"].max() <= 1
+    symmetries = {(bool(a), bool(b), bool(c)) for a, b, c in zip(*change[2:5], strict=True)}
+    assert len(symmetries) == 8
+    assert set(change.order) == set(range(6))
+    # By hand: the crop, transposed, mirrored, reordered and scaled.
+    for i in (0, 1, 2, 3):
+        c = jax.tree.map(lambda a, i=i: a[i], change)
+        expected = example["color"][c.row : c.row + 4, c.column : c.column + 4]
+        normal = example["normal"][c.row : c.row + 4, c.column : c.column + 4]
+        if c.transpose:
+            expected, normal = expected.swapaxes(0, 1), normal.swapaxes(0, 1)
+        rows, columns = (
+            slice(None, None, 1 - 2 * c.flip_rows),
+            slice(None, None, 1 - 2 * c.flip_columns),
+        )
+        colors = list(augmenting.ORDERS[c.order])
+        np.testing.assert_allclose(
+            many["color"][i], expected[rows, columns][..., colors] * scale[i], rtol=1e-6
+        )
+        np.testing.assert_array_equal(many["normal"][i], normal[rows, columns])
+
+
+def test_turns_without_flips_are_rotations():
+    keys = jax.random.split(jax.random.key(1), 64)
+    chosen = MixerConfig(steps=1, crop=4, flips=False, permute_colors=False)
+    change = jax.jit(jax.vmap(lambda k: augmenting.draw(k, (4, 4), chosen)))(keys)
+    mirrored = change.transpose ^ change.flip_rows ^ change.flip_columns
+    assert not mirrored.any()
+    assert change.transpose.any()
+    assert not change.order.any()
+
+
+def test_swap_symmetry(images):
+    """Asked the other way round, α is 1 − β; and the closed form's α and β add up to 1."""
+    x, y, variance, divergence = (
+        jnp.asarray(a) for a in (images.x, images.y, images.variance, images.divergence)
+    )
+    risk = pd.sure(x, y, variance, divergence)
+    paper = mixers.build("paper", {"width": 8})
+
+    @jax.jit
+    def both(params):
+        swapped = swapped_alpha(paper, params, x, y, variance, divergence, risk, jnp.asarray(True))
+        straight = swapped_alpha(
+            paper, params, y, x, risk, divergence, variance, jnp.asarray(False)
+        )
+        return swapped, straight
+
+    swapped, straight = both(paper.init(jax.random.key(0)))
+    np.testing.assert_allclose(swapped, 1 - straight, atol=1e-6)
+    alpha = pd.closed_form_alpha(x, y, variance, divergence, window=9)
+    beta = pd.closed_form_alpha(y, x, risk, divergence, window=9)
+    inner = (alpha > 0) & (alpha < 1)
+    assert inner.mean() > 0.2
+    np.testing.assert_allclose((alpha + beta)[inner], 1, atol=1e-4)
+
+
+def test_cache_of_estimates(real_frame, tmp_path):
+    frame = jax.tree.map(lambda a: a[:SIZE, :SIZE] if a.ndim else a, real_frame)
+    method = pd.MonteCarlo(1)
+    cache = EstimateCache(Blur(), method, tmp_path)
+    first = cache.get(frame)
+    again = EstimateCache(Blur(), method, tmp_path)
+    np.testing.assert_array_equal(again.get(frame).divergence, first.divergence)
+    assert (cache.misses, again.hits, again.misses) == (1, 1, 0)
+    f = Blur().bind(frame)
+    np.testing.assert_allclose(first.denoised, f(frame.color), rtol=1e-5, atol=1e-6)
+    # Everything that the result depends on is in the key.
+    keys = {
+        cache.key(frame, 0),
+        cache.key(frame, 1),
+        cache.key(frame.replace(variance=2 * frame.variance), 0),
+        cache.key(frame.replace(albedo=None), 0),
+        EstimateCache(Blur(0.5), method, tmp_path).key(frame, 0),
+        EstimateCache(Blur(), pd.MonteCarlo(2), tmp_path).key(frame, 0),
+        EstimateCache(Blur(), method, tmp_path, tangents=True).key(frame, 0),
+    }
+    assert len(keys) == 7
+    # Damaged entries are made again: cut short, and of one bit changed.
+    (path,) = tmp_path.iterdir()
+    data = path.read_bytes()
+    for damaged in (data[:-100], data[:-1] + bytes([data[-1] ^ 1]), b""):
+        path.write_bytes(damaged)
+        mended = EstimateCache(Blur(), method, tmp_path)
+        np.testing.assert_array_equal(mended.get(frame).divergence, first.divergence)
+        assert mended.misses == 1
+        assert path.read_bytes() == data
+    unnamed = EstimateCache(pd.FunctionDenoiser(lambda x: x / 2), method, tmp_path)
+    unnamed.get(frame)
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_tangents_in_the_cache(real_frame, tmp_path):
+    frame = jax.tree.map(lambda a: a[:SIZE, :SIZE] if a.ndim else a, real_frame)
+    found = EstimateCache(Blur(), pd.MonteCarlo(1), tmp_path, tangents=True).get(frame)
+    np.testing.assert_allclose(np.abs(found.probe), np.sqrt(frame.variance), rtol=1e-5)
+    # Blur is linear, so its derivative along the probe is itself.
+    np.testing.assert_allclose(
+        found.tangent, Blur()(frame.replace(color=jnp.asarray(found.probe))), rtol=1e-4, atol=1e-6
+    )
+
+
+def test_risk_of_the_mix_is_unbiased():
+    """Many noisy draws, a linear denoiser, and α that depends on x: only the full derivative will do."""
+    rng = np.random.default_rng(0)
+    truth, sigma, shrink = 0.5, 0.3, 0.4
+    x = truth + sigma * rng.normal(size=(200_000, 1, 1, 3))
+    y, variance = shrink * x + 0.4, np.full_like(x, sigma**2)
+    for alpha, slope in ((np.full_like(x, 0.6), 0.0), (1 / (1 + x**2), -2 * x / (1 + x**2) ** 2)):
+        z = x + alpha * (y - x)
+        error = (z - truth) ** 2
+        for derivative, unbiased in ((sigma**2 * slope, True), (0.0, np.all(slope == 0))):
+            risk = losses.mix_risk(alpha, x, y, variance, shrink * variance, derivative)
+            off = np.asarray(risk - error, np.float64)
+            standard_error = off.std() / np.sqrt(off.size)
+            assert (abs(off.mean()) < 4 * standard_error) == unbiased
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"loss": "sure", "sure_derivative": "probe", "draws": 2, "options": {"width": 4}},
+        {"loss": "logl1", "options": {"width": 4, "space": "log", "ratio": False, "sure": False}},
+    ],
+)
+def test_variants_have_finite_gradients(folder, tmp_path, changes):
+    task = MixerTask(_config(folder, **changes), denoiser=Blur(), cache_folder=tmp_path)
+    assert task.arrays["divergence"].shape == (4, changes.get("draws", 1), SIZE, SIZE, 3)
+
+    arrays = jax.tree.map(jnp.asarray, task.arrays)
+
+    @jax.jit
+    def gradient(key):
+        keys = jax.random.split(key, 2)
+        batch = jax.vmap(task.example, (None, 0, 0))(arrays, jnp.arange(2), keys)
+        params = task.init(key)
+        return jax.value_and_grad(lambda p: task.loss(p, batch)[0])(params)
+
+    loss, found = gradient(jax.random.key(2))
+    assert np.isfinite(loss)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
+    assert sum(float(jnp.abs(leaf).sum()) for leaf in jax.tree.leaves(found)) > 0
+
+
+def test_log_weights():
+    x, y = (np.random.default_rng(s).gamma(1, 2, (4, 5, 3)).astype(np.float32) for s in (0, 1))
+    y[0] = x[0]
+    alpha = np.full_like(x, 0.3)
+    found = mixers.architectures.from_log_weight(alpha, x, y)
+    z = np.expm1(0.7 * np.log1p(x) + 0.3 * np.log1p(y))
+    np.testing.assert_allclose(x + found * (y - x), z, rtol=1e-4)
+    np.testing.assert_allclose(found[0], 0.3)
+
+
+def test_index_and_split(folder, tmp_path):
+    items = index([folder])
+    assert [(i.scene, i.spp) for i in items] == [
+        (scene, spp) for scene in ("one", "three", "two") for spp in (4, 64)
+    ]
+    assert {i.reference.name for i in items} == {
+        f"{s}_004096spp.exr" for s in ("one", "two", "three")
+    }
+    assert {i.spp for i in index([folder], reference_spp=64)} == {4, 4096}
+    assert {i.spp for i in index([folder], spp=[64])} == {64}
+    nested = tmp_path / "a" / "b"
+    nested.mkdir(parents=True)
+    for spp in (2, 16):
+        (nested / f"one_{spp:06}spp.exr").touch()
+    more = index([folder, tmp_path])
+    assert [i.scene for i in more if i.spp == 2] == ["a/b/one"]
+    with pytest.raises(ValueError, match="are both one at 000004 spp"):
+        index([folder, _copy(folder, tmp_path / "copy")])
+    with pytest.raises(ValueError, match="no render at 3 spp named NAME_SSSSSSspp.exr"):
+        index([folder], spp=[3])
+    with pytest.raises(ValueError, match="is no folder"):
+        index([tmp_path / "nowhere"])
+    with pytest.raises(ValueError, match="name at least one folder"):
+        index([])
+
+    training, held = split(items, share=0.0001)
+    assert {i.scene for i in held}
+    assert {i.scene for i in held}.isdisjoint(i.scene for i in training)
+    for share in (0.3, 0.7):
+        ours, theirs = (split(a, share=share)[1] for a in (items, more))
+        if len({i.scene for i in ours}) > 1:
+            assert {i.scene for i in ours} <= {i.scene for i in theirs}
+    assert {i.scene for i in split(items, share=0.5, scenes=["two"])[1]} == {"two"}
+    with pytest.raises(ValueError, match="names four, not among"):
+        split(items, share=0.5, scenes=["four"])
+    with pytest.raises(ValueError, match="names every scene"):
+        split(items, share=0.5, scenes=["one", "two", "three"])
+    with pytest.raises(ValueError, match="at least two are needed"):
+        split(items[:2], share=0.5)
+
+
+def _copy(folder: Path, to: Path) -> Path:
+    to.mkdir()
+    (to / "one_000004spp.exr").touch()
+    return to
+
+
+def test_data_that_will_not_do(folder, tmp_path):
+    with pytest.raises(ValueError, match="crop is 64, but the images are 24×24"):
+        MixerTask(_config(folder, crop=64), denoiser=Blur(), cache_folder=tmp_path)
+    with pytest.raises(ValueError, match="oidn-hdr does not follow exposure"):
+        MixerTask(_config(folder, exposure_stops=1), denoiser=Blur())
+    with pytest.raises(ValueError, match="method is 'guess', expected one of monte-carlo"):
+        MixerTask(_config(folder, method="guess"), denoiser=Blur())
+    plain = np.ones((8, 8, 3), np.float32)
+    for scene in "ab":
+        for spp in (1, 2):
+            pd.write_exr(tmp_path / f"{scene}_{spp}spp.exr", plain)
+    with pytest.raises(ValueError, match="b_1spp.exr has no variance"):
+        MixerTask(_config(tmp_path, held_out_scenes=["a"]), denoiser=Blur(), cache_folder=tmp_path)
+
+
+def test_configurations(tmp_path):
+    assert config.names(MixerConfig) == ("cpu", "gpu", "paper", "smoke")
+    loaded = {name: config.load(MixerConfig, name) for name in config.names(MixerConfig)}
+    paper = loaded["paper"]
+    assert (paper.steps, paper.batch, paper.peak_rate, paper.loss) == (2_300_000, 12, 2e-5, "smape")
+    assert (paper.crop, paper.swap, paper.architecture) == (128, 0.5, "paper")
+    mine = tmp_path / "mine.toml"
+    mine.write_text('base = "smoke"\nsteps = 9\nspp = [8, 32]\noptions = { width = 4 }\n')
+    found = config.load(MixerConfig, mine, {"peak_rate": 1})
+    assert (found.steps, found.batch, found.spp, found.peak_rate) == (9, 2, (8, 32), 1.0)
+    assert dict(found.options) == {"width": 4}
+    assert isinstance(found.peak_rate, float)
+    other = tmp_path / "other.yaml"
+    other.write_text("base: mine.toml\nloss: relmse\n")
+    assert config.load(MixerConfig, other).steps == 9
+    assert config.parse_change("peak_rate=1e-3", MixerConfig) == ("peak_rate", 1e-3)
+    assert config.parse_change("denoiser=oidn-hdr", MixerConfig) == ("denoiser", "oidn-hdr")
+    assert config.parse_change("spp = [2, 8]", MixerConfig) == ("spp", [2, 8])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("stepz = 3", r"there is no field 'stepz'; did you mean 'steps'\?"),
+        ("qqqqq = 3", "there is no field 'qqqqq'; known are steps"),
+        ("batch = 3", "the field 'steps' is lacking"),
+        ("steps = 'many'", "steps is 'many', expected a whole number"),
+        ("steps = true", "steps is True, expected a whole number"),
+        ("steps = 0", "steps is 0, expected a whole number of at least 1"),
+        ("steps = 1\nspp = 8", "spp is 8, expected a list of a whole number"),
+        ("steps = 1\nspp = [1.5]", "an element of spp is 1.5"),
+        ("steps = 1\npeak_rate = -1.0", "peak_rate is -1.0, expected a number above 0"),
+        ("steps = 1\nloss = 'l2'", "loss is 'l2', expected one of 'smape'"),
+        ("steps = 1\nvariance_of = 'sd'", "variance_of is 'sd', expected one of 'mean'"),
+        ("steps = 1\nema = 1.5", "ema is 1.5, expected a decay below 1"),
+        ("steps = 1\nflips = 1", "flips is 1, expected true or false"),
+        ("steps = 1\noptions = 3", "options is 3, expected a table of settings"),
+        ("steps == 1", "is no TOML"),
+        ("base = 'bad.toml'", "begin from each other"),
+        ("base = 'nowhere.toml'", "nowhere.toml: there is no such file"),
+        ("base = 'big'", "config is 'big', expected one of cpu, gpu, paper, smoke, or a file"),
+    ],
+)
+def test_configurations_that_will_not_do(tmp_path, monkeypatch, text, message):
+    monkeypatch.chdir(tmp_path)
+    Path("bad.toml").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        config.load(MixerConfig, "bad.toml")
+
+
+def test_command(trainer, folder, tmp_path, monkeypatch, capsys):
+    """What the command line gives to training, and what it prints of the outcome."""
+    given = []
+
+    def task(chosen, *, cache_folder, progress):
+        given.append((chosen, cache_folder))
+        return trainer.task
+
+    monkeypatch.setattr("progden_jax.training.MixerTask", task)
+    monkeypatch.setattr("progden_jax.training.train", lambda task, *a, **k: trainer.run(*a, **k))
+    monkeypatch.setattr("progden_jax.enable_compilation_cache", lambda: None)
+    run, cache = str(tmp_path / "run"), tmp_path / "cache"
+    arguments = ["train", "mixer", "-o", run, "--config", "smoke", "--data", str(folder)]
+    full = [*arguments, "--cache", str(cache), "--set", "crop=8", "--set", "loss=relmse"]
+    assert main([*full, "--until", "1", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["step"] == 1
+    expected = config.load(
+        MixerConfig, "smoke", {"crop": 8, "loss": "relmse", "data": [str(folder)]}
+    )
+    assert given == [(expected, cache)]
+    assert main(full) == 0
+    first, *_, last = capsys.readouterr().out.splitlines()
+    assert first.startswith("step 3: score ")
+    assert "RMSE render 0." in first or "RMSE closed-form 0." in first
+    assert last.startswith("step 6; the best weights are of step ")
+    for wrong, message in (
+        ([*arguments, "--set", "crop"], "'crop' is no field=value"),
+        ([*arguments[:5], "big"], "config is 'big', expected one of cpu"),
+        (arguments[:6], "name folders of renders with --data"),
+        ([*arguments, "--until", "0"], "--until is 0"),
+    ):
+        assert main(wrong) == 2
+        assert message in capsys.readouterr().err
+
+
+def test_two_devices_train_as_one(tmp_path):
+    """In a process of its own, for the number of devices is fixed when JAX starts."""
+    environment = {
+        **os.environ,
+        "JAX_PLATFORMS": "cpu",
+        "XLA_FLAGS": "--xla_force_host_platform_device_count=2",
+        "PYTHONPATH": os.pathsep.join(sys.path),
+    }
+    command = [
+        sys.executable,
+        "-c",
+        f"import test_training as t; t.train_on_devices({str(tmp_path)!r})",
+    ]
+    subprocess.run(command, check=True, env=environment, cwd=Path(__file__).parent, timeout=300)
+    assert (tmp_path / "done").exists()
+
+
+def train_on_devices(folder: str) -> None:
+    """Fit a line on one device and on two: the same examples, the same weights but for rounding."""
+
+    class Line:
+        kind, items = "line", range(0)
+        config = config.RunConfig(steps=5, batch=4, log_every=5, evaluate_every=9)
+        arrays: ClassVar = {"x": np.linspace(0, 1, 8, dtype=np.float32)}
+
+        def init(self, key):
+            return {"slope": jnp.zeros(()), "offset": jnp.zeros(())}
+
+        def example(self, arrays, index, key):
+            x = arrays["x"][index]
+            return {"x": x, "y": 3 * x + 0.1 * jax.random.normal(key)}
+
+        def loss(self, params, batch):
+            error = params["slope"] * batch["x"] + params["offset"] - batch["y"]
+            return (error**2).mean(), {}
+
+    states = []
+    for count in (1, 2):
+        devices = jax.devices()[:count]
+        assert len(devices) == count
+        step = make_step(Line(), Mesh(np.asarray(devices), ("batch",)) if count > 1 else None)
+        state = initial_state(Line())
+        for _ in range(5):
+            state, scalars = step(state, Line.arrays, jax.random.key(1), jnp.asarray([0, 3, 5, 7]))
+        states.append((state.params, scalars))
+    one, two = (jax.tree.map(np.asarray, s) for s in states)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), one, two)
+    assert one[0]["slope"] > 0
+    Path(folder, "done").touch()
+
+
+def test_a_batch_that_devices_cannot_share(trainer):
+    with pytest.raises(ValueError, match="batch is 2, which 3 devices cannot share"):
+        Trainer(trainer.task, devices=[None] * 3)
