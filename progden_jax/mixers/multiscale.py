@@ -22,8 +22,8 @@ CHANNELS = 54
 class Multiscale:
     """α = sigmoid(logit(closed form over 15×15) + network(`features`)).
 
-    The features are ratios, so that exposure does not matter, and carry what the paper's network would have to
-    learn to average: a third of its weights do better after hours of training instead of days. Starting
+    The features are ratios, so that exposure does not matter, and carry what the paper's network would have
+    to learn to average: with a third of its weights an hour of training is enough. Starting
     from the closed form it does not collapse to α = 1, so it needs no swaps.
 
     Parameters
@@ -110,8 +110,9 @@ def features(
     """What the network sees, the closed form over 15×15 windows, and where such a window has variance.
 
     All are ratios of means over windows, RGB each: of every window the closed-form α and log (y − x)²/σ²;
-    of two f'; then per pixel log (y − x)²/σ², f' and α, the noise relative to the local brightness, the
-    variance and brightness relative to their surroundings, and y − x in units of its local size and of the noise.
+    of two f'; then per pixel log (y − x)²/σ², f' and α, the noise relative to the local brightness,
+    variance and brightness relative to their surroundings, and x − y in units of its local size and of
+    the noise.
 
     Parameters
     ----------

@@ -35,7 +35,7 @@ def log_errors(
     y: Float[Array, "*b h w 3"],
     reference: Float[Array, "*b h w 3"],
 ) -> Float[Array, "*b"]:
-    """log SMAPE + log RMSE of each image: one percent off either counts the same, in easy images and hard ones.
+    """log SMAPE + log RMSE of each image: one percent off either counts alike, whatever the image.
 
     A small share of the lesser error of x and y is added, so that an image that is nearly right does not
     outweigh all others.
