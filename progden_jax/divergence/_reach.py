@@ -85,6 +85,8 @@ def _follow(jaxpr: core.Jaxpr, arguments: Sequence[_Spans | None]) -> list[_Span
     bind(jaxpr.invars, arguments)
     for equation in _needed(jaxpr):
         inputs = [of(v) for v in equation.invars]
+        if all(v.aval.size == 0 for v in equation.outvars):
+            continue  # Nothing carries no tangent.
         if any(s is not None for s in inputs):
             bind(equation.outvars, _apply(equation, inputs))
     return [of(v) for v in jaxpr.outvars]
