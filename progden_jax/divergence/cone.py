@@ -141,7 +141,7 @@ def multiply_adds(plan: Plan, params: Any) -> float:
             elif _shifting(origin, window):
                 taps = (kernel.shape[0] * min(origin.size, window.size)) ** 2
             else:
-                taps = sum(_overlap(origin, window, tap)[2] for tap in _taps(kernel.shape[0])) ** 2
+                taps = sum(_overlap(origin, window, tap) for tap in _taps(kernel.shape[0])) ** 2
             total += (
                 3 * taps * part.stop * kernel.shape[3] - 3 * taps * part.start * kernel.shape[3]
             )
@@ -165,15 +165,10 @@ def _shifting(source: Window, target: Window) -> bool:
     return bool((shifts != shifts[0]).any())
 
 
-def _overlap(source: Window, target: Window, tap: int) -> tuple[int, int, int]:
-    """Start in target and source, and length, of where target pixel o reads source pixel o + tap.
-
-    For windows whose offset is the same in every phase.
-    """
+def _overlap(source: Window, target: Window, tap: int) -> int:
+    """How many target pixels o read a source pixel o + tap, for windows at one offset in every phase."""
     shift = int(target.origin[0] - source.origin[0]) + tap
-    start = max(0, -shift)
-    length = min(target.size, source.size - shift) - start
-    return start, start + shift, max(length, 0)
+    return max(min(target.size, source.size - shift) - max(0, -shift), 0)
 
 
 class Sweep:
@@ -274,36 +269,24 @@ class Sweep:
         return total
 
     def _convolve_window(self, x: Array, source: Window, weights: Array, target: Window) -> Array:
-        """Products of every tap with the pixels where source and target windows overlap."""
+        """The convolution of a window, zero around it, as far as the target window goes."""
+        r = weights.shape[0] // 2
         if _shifting(source, target):
-            r = weights.shape[0] // 2
             if source.size < target.size:
                 wide = Window(source.origin - r, source.size + 2 * r)
                 return self._move(self._convolve_window(x, source, weights, wide), wide, target)
             wide = Window(target.origin - r, target.size + 2 * r)
             x, source = self._move(x, source, wide), wide
-        total = None
-        for i, tap_i in enumerate(_taps(weights.shape[0])):
-            to_row, row, rows = _overlap(source, target, tap_i)
-            for j, tap_j in enumerate(_taps(weights.shape[1])):
-                to_column, column, columns = _overlap(source, target, tap_j)
-                if not rows or not columns:
-                    continue
-                part = x[:, row : row + rows, column : column + columns]
-                part = self._product(part, weights[i, j])
-                if (rows, columns) != (target.size, target.size):
-                    part = jnp.pad(
-                        part,
-                        (
-                            (0, 0),
-                            (to_row, target.size - to_row - rows),
-                            (to_column, target.size - to_column - columns),
-                            (0, 0),
-                        ),
-                    )
-                total = part if total is None else total + part
-        assert total is not None
-        return total
+        before = r - int(target.origin[0] - source.origin[0])
+        padding = (before, target.size - source.size - before + 2 * r)
+        return lax.conv_general_dilated(
+            x,
+            weights,
+            (1, 1),
+            (padding, padding),
+            dimension_numbers=("NHWC", "HWIO", "NHWC"),
+            precision=self.precision,
+        )
 
     def _product(self, x: Array, weights: Array) -> Array:
         flat = jnp.matmul(x.reshape(-1, x.shape[-1]), weights, precision=self.precision)
