@@ -81,8 +81,14 @@ def plot(header: Sequence[str], rows: Sequence[tuple], path: Path) -> None:
                 for g, c in found.items()
                 if g[0] == "scale" and g[2] == exposure and g[4] == method
             )
-            _line(scales, points, f"{method}, {exposure} exposure", color, style, marker=".")
-    scales.set(xscale="log", yscale="log", xlabel="radiance ×", title="Scale, float32, ε = 1e-4")
+            label = method if exposure == "automatic" else ""
+            _line(scales, points, label, color, style, marker=".")
+    scales.set(
+        xscale="log",
+        yscale="log",
+        xlabel="radiance ×",
+        title="Scale, float32, ε = 1e-4; dashed: fixed exposure",
+    )
 
     settings = list(dict.fromkeys(g[1] for g in found if g[0] == "inputs"))
     for offset, (method, color) in enumerate(COLORS.items()):
@@ -92,14 +98,13 @@ def plot(header: Sequence[str], rows: Sequence[tuple], path: Path) -> None:
                 for g, c in found.items()
                 if g[0] == "inputs" and g[4] == method
             ]
-            name = "numerical" if column == "elsewhere" else "with chance"
-            _line(inputs, points, f"{method}, {name}", color, "", marker=marker)
-    inputs.set(yscale="log", title="Hard inputs, float32; pixels not tampered with")
+            _line(inputs, points, method if marker == "o" else "", color, "none", marker=marker)
+    inputs.set(yscale="log", title="Hard inputs, float32, untouched pixels; bars: with chance")
     inputs.set_xticks(range(len(settings)), settings)
     for axes in (steps, scales, inputs):
         axes.set_ylabel("relative RMSE of σ²f'")
         axes.grid(alpha=0.3)
-        axes.legend(fontsize=6)
+        axes.legend(fontsize=7)
     figure.savefig(path, dpi=110)
 
 
@@ -108,4 +113,12 @@ def _line(
 ) -> None:
     if points:
         x, y = zip(*points, strict=True)
-        axes.plot(x, np.maximum(y, 1e-9), style, color=color, marker=marker, label=label)
+        axes.plot(
+            x,
+            np.maximum(y, 1e-9),
+            linestyle=style,
+            color=color,
+            marker=marker,
+            label=label or None,
+            ms=6,
+        )

@@ -188,7 +188,7 @@ def compare(
     frame = case.frame
     assert frame.variance is not None
     f = rounding.tf32(case.f) if network == "TF32" else case.f
-    if isinstance(method, float | int):
+    if isinstance(method, int | float):
         estimate = differences(f, frame.color, frame.variance, jnp.float32(method))
     else:
         estimate = pd.divergence(f, frame.color, frame.variance, method=method, key=KEY)

@@ -58,8 +58,8 @@ class OIDN(Network):
         found from each frame's log-average luminance, as OIDN does. A constant in derivatives.
     name : for messages.
     precision : of the convolutions; "highest" keeps float32 on GPUs. "tensorfloat32" (GPUs only) is about
-        1e-3 off in the image and 2 to 8 % in the divergence, "bfloat16" 1e-2 and 5 to 20 % (relative
-        RMSE: experiments/stability). Neither will do for finite differences. Exact("cone") computes in
+        6e-4 off in the image and 4 % in the divergence, "bfloat16" 6e-3 and 10 % (relative RMSE per
+        pixel: experiments/stability). Neither will do for finite differences. Exact("cone") computes in
         float32 whatever this says.
     """
 
