@@ -37,6 +37,7 @@ def _convolve(inputs: Array, kernel: Array, precision: Any) -> Array:
     )
 
 
+@functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
 def same_convolution(
     inputs: Float[Array, "n h w ci"],
     kernel: Float[Array, "kh kw ci co"],
@@ -47,16 +48,10 @@ def same_convolution(
     XLA makes the derivative by the kernel a convolution with a kernel as large as the image, which runs on
     CPUs at a fifth to a tenth of the forward pass's speed. There it is matrix products here.
     """
-    # JAX's custom derivatives do not take NumPy arrays under every transformation.
-    return _same(jnp.asarray(inputs), jnp.asarray(kernel), precision)
-
-
-@functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
-def _same(inputs: Array, kernel: Array, precision: Any) -> Array:
     return _convolve(inputs, kernel, precision)
 
 
-@functools.partial(_same.defjvp, symbolic_zeros=True)
+@functools.partial(same_convolution.defjvp, symbolic_zeros=True)
 def _jvp(
     precision: Any, primals: tuple[Array, Array], tangents: tuple[Any, Any]
 ) -> tuple[Array, Array]:

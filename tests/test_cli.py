@@ -240,6 +240,19 @@ def test_weights_from_a_file(tmp_path, noisy, progden):
     np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
 
 
+def test_own_network_from_a_file(tmp_path, noisy, frames, progden):
+    import jax
+
+    net = pd.denoisers.KPCN.init(jax.random.key(0), ("variance",), layers=1, width=4)
+    pd.denoisers.save(tmp_path / "net.safetensors", net, dtype="float32")
+    flags = ["--denoiser", tmp_path / "net.safetensors", "--json"]
+    status, out, _ = progden("denoise", noisy, "-o", tmp_path / "o.exr", *flags)
+    assert (status, report(out)[0]["denoiser"]) == (0, "net")
+    assert report(out)[0]["auxiliary"] == ["variance"]
+    expected = pd.progressive_denoise(frames[8], net).image
+    np.testing.assert_allclose(read_exr(tmp_path / "o.exr").color, expected, rtol=1e-3, atol=1e-5)
+
+
 def test_prefilter_changes_what_the_network_sees(tmp_path, noisy, frames, progden):
     out = tmp_path / "o.exr"
     assert progden("denoise", noisy, "-o", out, "--prefilter", "--save", "albedo")[0] == 0
@@ -558,6 +571,8 @@ FILE_FAILURES = {
     "wrong part": (["--part", "7"], "part"),
     "missing weights": (["--weights", "{tmp}/none.tza"], "none.tza"),
     "damaged weights": (["--weights", "{tmp}/bad.tza"], "bad.tza"),
+    "damaged weights of our own": (["--denoiser", "{tmp}/bad.safetensors"], "no safetensors file"),
+    "absent weights of our own": (["--denoiser", "{tmp}/none.safetensors"], "No such file"),
     "reference of another size": (["--reference", "{tmp}/small.exr"], "20×10"),
     "other render of another size": (["--variance-from", "{tmp}/small.exr"], "small.exr"),
     "same image twice": (["--variance-from", "{tmp}/room.exr"], "same image"),
@@ -569,7 +584,8 @@ FILE_FAILURES = {
 @pytest.mark.parametrize("name", list(FILE_FAILURES))
 def test_failures_with_files(tmp_path, noisy, progden, name):
     flags, reason = FILE_FAILURES[name]
-    (tmp_path / "bad.tza").write_bytes(b"nonsense")
+    for weights in ("bad.tza", "bad.safetensors"):
+        (tmp_path / weights).write_bytes(b"nonsense")
     write_exr(tmp_path / "small.exr", np.ones((10, 20, 3), "f4"))
     flags = [f.format(tmp=tmp_path) for f in flags]
     status, stdout, stderr = progden("denoise", noisy, "-o", tmp_path / "o.exr", *flags)
@@ -697,6 +713,7 @@ CONTRADICTIONS = [
     "--denoiser oidn-hdr --weights net.tza",
     "--denoiser oidn-hdr --quality high",
     "--weights net.tza --quality fast",
+    "--denoiser net.safetensors --exposure 2",
     "--no-aux --clean-aux",
     "--no-aux --prefilter",
     "--no-aux --denoiser oidn-hdr-alb",

@@ -145,8 +145,8 @@ def test_activation_has_a_gradient_at_the_start(images):
 def test_convolution_and_its_derivatives(channels):
     """Forward and reverse mode, second derivatives and batches, against XLA's own."""
     rng = np.random.default_rng(0)
-    x = rng.normal(size=(2, 2, 6, 7, channels)).astype(np.float32)
-    kernel = rng.normal(size=(3, 5, channels, 2)).astype(np.float32) / channels
+    x = jnp.asarray(rng.normal(size=(2, 2, 6, 7, channels)), jnp.float32)
+    kernel = jnp.asarray(rng.normal(size=(3, 5, channels, 2)) / channels, jnp.float32)
 
     def plain(x, kernel):
         numbers = ("NHWC", "HWIO", "NHWC")

@@ -36,7 +36,7 @@ class Rows(NamedTuple):
     truth: float
 
 
-def sample_rows(frame: pd.Frame, denoiser: pd.denoisers.OIDN, count: int) -> Rows:
+def sample_rows(frame: pd.Frame, denoiser: pd.Denoiser, count: int) -> Rows:
     """`count` rows, drawn more often where σ is large and weighted back by `share`."""
     assert frame.variance is not None
     variance = np.asarray(frame.variance, np.float64).ravel()
@@ -46,7 +46,7 @@ def sample_rows(frame: pd.Frame, denoiser: pd.denoisers.OIDN, count: int) -> Row
 
     @jax.jit
     def run(
-        denoiser: pd.denoisers.OIDN, frame: pd.Frame, index: jax.Array
+        denoiser: pd.Denoiser, frame: pd.Frame, index: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         value, transpose = jax.vjp(denoiser.bind(frame), frame.color)
 

@@ -35,9 +35,7 @@ def methods(most: int) -> dict[tuple[str, int], pd.Method]:
     return found
 
 
-def measure(
-    frame: pd.Frame, denoiser: pd.denoisers.OIDN, truth_probes: int, most: int
-) -> list[tuple]:
+def measure(frame: pd.Frame, denoiser: pd.Denoiser, truth_probes: int, most: int) -> list[tuple]:
     """(method, probes, relative error, relative error of the truth) for every method."""
     f, x, variance = denoiser.bind(frame), frame.color, frame.variance
     assert variance is not None

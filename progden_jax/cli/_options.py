@@ -13,7 +13,7 @@ from cyclopts import Parameter
 from progden_jax.cli._run import UsageError
 
 if TYPE_CHECKING:
-    from progden_jax.denoisers import OIDN
+    from progden_jax.denoisers import Network
     from progden_jax.divergence import Method
     from progden_jax.exr import Settings
     from progden_jax.frame import Frame
@@ -122,7 +122,8 @@ class NetworkOptions:
     denoiser: Annotated[
         str | None,
         Parameter(
-            help="A network by name, such as oidn-hdr-alb; by default OIDN's for the buffers in the file."
+            help="A network by name, such as oidn-hdr-alb, or a file of weights (.tza, .safetensors); by "
+            "default OIDN's for the buffers in the file."
         ),
     ] = None
     quality: Annotated[
@@ -165,20 +166,24 @@ class NetworkOptions:
         if self.no_aux and aux_flag:
             raise UsageError(f"--no-aux leaves out the albedo and normal that {aux_flag} is about.")
         name = self.denoiser
-        if name and not name.endswith(".tza") and name not in denoisers.names():
+        file = bool(name and name.endswith((".tza", ".safetensors")))
+        if name and not file and name not in denoisers.names():
             raise UsageError(
-                f"--denoiser is {name!r}, expected one of {', '.join(denoisers.names())}."
+                f"--denoiser is {name!r}, expected one of {', '.join(denoisers.names())}, or a file that "
+                "ends in .tza or .safetensors."
             )
-        if name and self.no_aux and "-alb" in name.replace("calb", "alb"):
+        if name and not file and self.no_aux and "-alb" in name.replace("calb", "alb"):
             raise UsageError(f"--no-aux leaves out the albedo that {name} takes.")
-        if name and aux_flag and not name.startswith("oidn-hdr-calb") and not name.endswith(".tza"):
+        if name and aux_flag and not name.startswith("oidn-hdr-calb") and not file:
             raise UsageError(
                 f"{aux_flag} is for networks that take clean albedo and normal (oidn-hdr-calb-cnrm), "
                 f"and --denoiser names {name}."
             )
         if self.weights and self.weights.suffix != ".tza":
             raise UsageError(f"--weights is {self.weights}, expected a file that ends in .tza.")
-        self.exposure_value()
+        exposed = not name or name.endswith(".tza") or name in denoisers.oidn.NAMES
+        if self.exposure_value() is not None and not exposed:
+            raise UsageError(f"--exposure is for OIDN's networks, and --denoiser names {name}.")
 
     def exposure_value(self) -> float | None:
         """The exposure as the library takes it."""
@@ -192,7 +197,7 @@ class NetworkOptions:
             raise UsageError(f"--exposure is {self.exposure!r}, expected auto or a number above 0.")
         return value
 
-    def load(self, frame: "Frame") -> "tuple[Frame, OIDN]":
+    def load(self, frame: "Frame") -> "tuple[Frame, Network]":
         """The frame as the network is to see it (prefiltered if asked for), and the network."""
         from progden_jax import denoisers
 

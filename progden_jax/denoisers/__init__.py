@@ -2,27 +2,37 @@
 
 import os
 from pathlib import Path
+from typing import cast
 
 import jax.numpy as jnp
 
-from progden_jax import _checks
-from progden_jax.denoisers import oidn, unet
+from progden_jax import _checks, _safetensors
+from progden_jax.denoisers import files, graph, oidn, unet
 from progden_jax.denoisers._base import Bound, Denoiser, FunctionDenoiser
+from progden_jax.denoisers._network import PRECISIONS, Network
+from progden_jax.denoisers.files import save, save_tza
 from progden_jax.denoisers.oidn import OIDN
+from progden_jax.denoisers.own import ARCHITECTURES, INPUT_SETS, KPCN, UNet
 from progden_jax.denoisers.tza import read_tza, write_tza
 from progden_jax.frame import Frame
 
 __all__ = [
+    "ARCHITECTURES",
+    "INPUT_SETS",
+    "KPCN",
     "OIDN",
     "QUALITIES",
     "Bound",
     "Denoiser",
     "FunctionDenoiser",
+    "Network",
+    "UNet",
     "for_frame",
     "load",
     "names",
     "prefilter",
     "read_tza",
+    "save",
     "save_tza",
     "usable_inputs",
     "write_tza",
@@ -35,8 +45,8 @@ _SIZES = {"fast": ("-small", ""), "balanced": ("",), "high": ("-large", "")}
 
 
 def names() -> tuple[str, ...]:
-    """The names that `load` knows."""
-    return oidn.NAMES
+    """The names that `load` knows: OIDN's networks, and the project's own that come with the package."""
+    return (*oidn.NAMES, *files.shipped())
 
 
 def load(
@@ -45,13 +55,14 @@ def load(
     exposure: float | None = None,
     inputs: tuple[str, ...] | None = None,
     precision: str = "highest",
-) -> OIDN:
-    """The denoiser of that name, or of the weights file (.tza) at that path.
+) -> Network:
+    """The denoiser of that name, or of the weights file at that path.
 
     Parameters
     ----------
-    name : one of `names()`, such as "oidn-hdr-alb-nrm", or the path of a file that ends in .tza.
-    exposure : see `OIDN`.
+    name : one of `names()`, such as "oidn-hdr-alb-nrm", or the path of a file that ends in .tza (an `OIDN`)
+        or .safetensors (a `UNet` or `KPCN`, as `save` wrote it).
+    exposure : see `OIDN`; the project's own networks take none.
     inputs : auxiliary buffers of a .tza file's network; by default by its number of input channels:
         3 radiance, 6 with albedo, 9 with albedo and normal.
     precision : see `OIDN`.
@@ -59,31 +70,40 @@ def load(
     Raises
     ------
     ValueError
-        If there is no such name or file, or the file holds other weights than of OIDN's U-Net.
+        If there is no such name or file, or the file holds other weights.
     """
     if exposure is not None and not exposure > 0:
         raise ValueError(f"exposure is {exposure}, expected a number above 0.")
-    _checks.choice("precision", precision, ("highest", "high", "default", "tensorfloat32"))
-    if str(name).endswith(".tza"):
+    text = os.fspath(name)
+    _checks.choice("precision", precision, PRECISIONS)
+    if text.endswith(".tza"):
         params = unet.from_tensors(read_tza(name))
         if inputs is None:
-            inputs = _inputs_of(params, source=os.fspath(name))
+            inputs = _inputs_of(params, source=text)
         return OIDN(params, inputs, exposure=exposure, name=Path(name).stem, precision=precision)
-    if name not in names():
+    if inputs is not None:
+        raise ValueError(f"inputs is {inputs}; only .tza files do not tell, and {text} does.")
+    if text in oidn.NAMES:
+        base = text.removeprefix("oidn-")
+        kind = base.removesuffix("-small").removesuffix("-large")
+        params = oidn.shipped_params("rt_" + base.replace("-", "_"))
+        return OIDN(params, oidn.INPUTS[kind], exposure=exposure, name=text, precision=precision)
+    own = files.shipped()
+    if not text.endswith(_safetensors.ENDING) and text not in own:
         raise ValueError(
-            f"denoiser is {os.fspath(name)!r}, expected one of {', '.join(names())}, "
-            "or a path that ends in .tza."
+            f"denoiser is {text!r}, expected one of {', '.join(names())}, "
+            "or a path that ends in .tza or .safetensors."
         )
-    base = str(name).removeprefix("oidn-")
-    kind = base.removesuffix("-small").removesuffix("-large")
-    params = oidn.shipped_params("rt_" + base.replace("-", "_"))
-    return OIDN(params, oidn.INPUTS[kind], exposure=exposure, name=str(name), precision=precision)
+    if exposure is not None:
+        raise ValueError(
+            f"exposure is {exposure}, and {text} is no OIDN network: it takes radiance as it is."
+        )
+    return files.load_own(own.get(text, Path(text)), precision=precision)
 
 
 def _inputs_of(params: unet.Params, *, source: str) -> tuple[str, ...]:
-    first = unet.layout(params)[0][0][0]
-    channels = params[first]["kernel"].shape[2]
-    by_channels = {3: (), 6: ("albedo",), 9: ("albedo", "normal")}
+    channels = graph.input_channels(unet.graph(params), params)
+    by_channels = {3 * (1 + len(inputs)): inputs for inputs in oidn.INPUTS.values()}
     if channels not in by_channels:
         raise ValueError(
             f"{source} holds a network of {channels} input channels; expected 3 (radiance), "
@@ -127,8 +147,8 @@ def for_frame(
     stem = {0: "oidn-hdr", 1: "oidn-hdr-alb", 2: "oidn-hdr-alb-nrm"}[len(found)]
     if clean_aux and len(found) == 2:
         stem = "oidn-hdr-calb-cnrm"
-    name = next(stem + size for size in _SIZES[quality] if stem + size in names())
-    return load(name, exposure=exposure)
+    name = next(stem + size for size in _SIZES[quality] if stem + size in oidn.NAMES)
+    return cast(OIDN, load(name, exposure=exposure))
 
 
 def prefilter(frame: Frame, *, quality: str = "balanced") -> Frame:
@@ -146,8 +166,3 @@ def prefilter(frame: Frame, *, quality: str = "balanced") -> Frame:
             params = oidn.shipped_params(f"rt_{short}{size}")
             filtered[role] = oidn.prefilter_buffer(params, jnp.asarray(buffer), role=role)
     return frame.replace(**filtered)
-
-
-def save_tza(path: str | os.PathLike[str], denoiser: OIDN, *, dtype: str = "float16") -> None:
-    """Write a denoiser's weights as a .tza archive; OIDN's own library takes those in float16 only."""
-    write_tza(path, unet.to_tensors(denoiser.params, dtype))

@@ -5,7 +5,6 @@ order of evaluation, each naming those it reads. Strides are powers of two; a no
 value per 2^n × 2^n pixels.
 """
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -14,48 +13,47 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from progden_jax.denoisers.nodes import (
+    Add,
+    Affine,
+    Conv,
+    Filter,
+    Input,
+    LeakyRelu,
+    MaxPool,
+    Node,
+    Pointwise,
+    Relu,
+    Upsample,
+    sources,
+)
 
-@dataclasses.dataclass(frozen=True)
-class Input:
-    """The network's input, all channels; only the first three are differentiated."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Conv:
-    """Convolution of odd size, zero padding, of one or several nodes side by side (a concatenation)."""
-
-    sources: tuple[int, ...]
-    layer: str
-    """Name of the parameters {"kernel": (k, k, in, out), "bias": (out,)}."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Relu:
-    source: int
-
-
-@dataclasses.dataclass(frozen=True)
-class MaxPool:
-    """Largest of each 2×2, the first in raster order on ties."""
-
-    source: int
-
-
-@dataclasses.dataclass(frozen=True)
-class Upsample:
-    """Each value repeated over 2×2. Read by convolutions only."""
-
-    source: int
-
-
-@dataclasses.dataclass(frozen=True)
-class Add:
-    """The sum of two nodes of one shape: a residual connection."""
-
-    sources: tuple[int, int]
-
-
-Node = Input | Conv | Relu | MaxPool | Upsample | Add
+__all__ = [
+    "Add",
+    "Affine",
+    "Conv",
+    "Filter",
+    "Input",
+    "Layered",
+    "LeakyRelu",
+    "MaxPool",
+    "Node",
+    "Pointwise",
+    "Relu",
+    "Upsample",
+    "Weighted",
+    "alignment",
+    "channels",
+    "children",
+    "evaluate",
+    "input_channels",
+    "levels",
+    "max_pool",
+    "multiply_adds",
+    "patches",
+    "receptive_radius",
+    "sources",
+]
 
 
 class Layered(NamedTuple):
@@ -73,15 +71,12 @@ class Layered(NamedTuple):
     """From the network's output (H, W, 3) to y, per pixel and channel."""
 
 
-def sources(node: Node) -> tuple[int, ...]:
-    """The nodes that a node reads."""
-    match node:
-        case Input():
-            return ()
-        case Conv() | Add():
-            return node.sources
-        case _:
-            return (node.source,)
+class Weighted(NamedTuple):
+    """What a `Filter` computed, which fixes its derivative."""
+
+    weights: Float[Array, "h w taps"]
+    image: Float[Array, "h w c"]
+    result: Float[Array, "h w c"]
 
 
 def levels(nodes: Sequence[Node]) -> list[int]:
@@ -106,6 +101,73 @@ def levels(nodes: Sequence[Node]) -> list[int]:
     return found
 
 
+def alignment(nodes: Sequence[Node]) -> int:
+    """The largest stride in pixels: images are padded to multiples of it."""
+    return 1 << max(levels(nodes))
+
+
+def receptive_radius(nodes: Sequence[Node], params: Any) -> int:
+    """How many pixels away the input can be that an output pixel depends on."""
+    reach: list[int] = []
+    for node, level in zip(nodes, levels(nodes), strict=True):
+        match node:
+            case Input():
+                radius = 0
+            case Conv():
+                radius = max(reach[s] for s in node.sources)
+                radius += (params[node.layer]["kernel"].shape[0] // 2) << level
+            case MaxPool():
+                # The blocks that pooling fixes in place reach one pixel of its source further.
+                radius = reach[node.source] + (1 << (level - 1))
+            case Filter():
+                radius = max(reach[node.logits], reach[node.image] + (node.size // 2 << level))
+            case _:
+                radius = max(reach[s] for s in sources(node))
+        reach.append(radius)
+    return reach[-1]
+
+
+def channels(nodes: Sequence[Node], params: Any) -> list[int]:
+    """Of each node, its channels; the input has as many as the first convolution of it alone takes.
+
+    Raises
+    ------
+    ValueError
+        If the weights of a layer do not fit its place, or no convolution reads the input alone.
+    """
+    widths: list[int] = []
+    for node in nodes:
+        match node:
+            case Input():
+                width = input_channels(nodes, params)
+            case Conv():
+                kernel = params[node.layer]["kernel"].shape
+                width, taken = kernel[-1], sum(widths[s] for s in node.sources)
+                expected = (kernel[0], kernel[0], taken, width)
+                bias = params[node.layer].get("bias")
+                bias_fits = bias is None or bias.shape == (width,)
+                if kernel != expected or kernel[0] % 2 == 0 or not bias_fits:
+                    raise ValueError(
+                        f"layer {node.layer} has a kernel of shape {kernel} and a bias of shape "
+                        f"{getattr(bias, 'shape', None)}; at its place a kernel takes {taken} channels, "
+                        "is square with an odd edge, and has one bias per output channel."
+                    )
+            case Pointwise(channels=int(first)):
+                width = first
+            case _:
+                width = widths[sources(node)[0]]
+        widths.append(width)
+    return widths
+
+
+def input_channels(nodes: Sequence[Node], params: Any) -> int:
+    """As many as the first convolution takes that reads the input alone."""
+    for node in nodes:
+        if isinstance(node, Conv) and node.sources == (0,):
+            return params[node.layer]["kernel"].shape[2]
+    raise ValueError("no convolution of the graph reads the input alone.")
+
+
 def multiply_adds(nodes: Sequence[Node], params: Any) -> float:
     """Of the convolutions of one forward pass, per pixel."""
     return sum(
@@ -122,61 +184,106 @@ def evaluate(
     *,
     inside: Array | None = None,
     precision: Any = lax.Precision.HIGHEST,
-) -> tuple[Float[Array, "h w c"], dict[int, Array]]:
-    """The output, and what fixes the derivative: where each `Relu` passes (bool), which of four won each
-    `MaxPool` (uint8), and the image's extent, (h, w, 1), for each `Conv` that no ReLU bounds to it.
+) -> tuple[Float[Array, "h w c"], dict[int, Any]]:
+    """The output, and what fixes the derivative, per node that has more to it than its parameters.
+
+    Of each `Relu` where it passes and of each `LeakyRelu` where its input is positive (bool), of each
+    `Pointwise` its slope, of each `MaxPool` which of four won (uint8), of each `Filter` a `Weighted`, and the
+    image's extent, (h, w, 1), for each `Conv` that nothing read from it bounds to that.
 
     `inside` (H, W, 1) is False where the input is padding around the image that a traced size leaves.
     """
-    masks = _mask_pyramid(inside, max(levels(nodes)))
-    bare = _not_rectified(nodes)
+    strides = levels(nodes)
+    masks = _mask_pyramid(inside, max(strides))
+    bare = _not_bounded(nodes)
     values: list[Array] = []
-    kept: dict[int, Array] = {}
-    for index, (node, level) in enumerate(zip(nodes, levels(nodes), strict=True)):
+    kept: dict[int, Any] = {}
+
+    def bounded(value: Array, level: int) -> Array:
+        return value if masks is None else jnp.where(masks[level], value, 0)
+
+    for index, (node, level) in enumerate(zip(nodes, strides, strict=True)):
         match node:
             case Input():
                 value = inputs
             case Conv():
                 x = jnp.concatenate([values[s] for s in node.sources], axis=-1)
-                layer = params[node.layer]
-                value = lax.conv_general_dilated(
-                    x[None],
-                    layer["kernel"],
-                    (1, 1),
-                    "SAME",
-                    dimension_numbers=("NHWC", "HWIO", "NHWC"),
-                    precision=precision,
-                )[0]
-                value = value + layer["bias"]
+                value = _convolve(params[node.layer], x, precision)
                 if index in bare:
-                    kept[index] = jnp.ones((*value.shape[:2], 1), bool)
-                    if masks is not None:
-                        kept[index] = masks[level]
-                        value = jnp.where(masks[level], value, 0)
+                    extent = jnp.ones((*value.shape[:2], 1), bool)
+                    kept[index] = extent if masks is None else masks[level]
+                    value = bounded(value, level)
             case Relu():
                 passes = values[node.source] > 0
                 if masks is not None:
                     passes &= masks[level]
                 kept[index] = passes
                 value = jnp.where(passes, values[node.source], 0)
+            case LeakyRelu():
+                x = values[node.source]
+                kept[index] = x > 0
+                value = jnp.where(kept[index], x, params[node.layer]["slope"] * x)
+            case Affine():
+                layer = params[node.layer]
+                value = bounded(values[node.source] * layer["scale"] + layer["shift"], level)
+            case Pointwise():
+                x = values[node.source][..., : node.channels]
+                value, slope = jax.jvp(node.function, (x,), (jnp.ones_like(x),))
+                value, kept[index] = bounded(value, level), bounded(slope, level)
             case MaxPool():
-                candidates = jnp.stack(children(values[node.source]))
-                kept[index] = jnp.argmax(candidates, axis=0).astype(jnp.uint8)
-                value = candidates.max(0)
+                kept[index] = jnp.argmax(jnp.stack(children(values[node.source])), axis=0).astype(
+                    jnp.uint8
+                )
+                value = max_pool(values[node.source])
             case Upsample():
-                value = jnp.repeat(jnp.repeat(values[node.source], 2, 0), 2, 1)
+                value = upsample(values[node.source])
             case Add():
                 value = values[node.sources[0]] + values[node.sources[1]]
+            case Filter():
+                mask = None if masks is None else masks[level]
+                kept[index] = _filter(values[node.image], values[node.logits], node.size, mask)
+                value = kept[index].result
         values.append(value)
     return values[-1], kept
 
 
-def _not_rectified(nodes: Sequence[Node]) -> set[int]:
-    """Convolutions read by other than a ReLU: padding beyond the image is not zero there by itself."""
+def _convolve(layer: Any, x: Array, precision: Any) -> Array:
+    value = lax.conv_general_dilated(
+        x[None],
+        layer["kernel"],
+        (1, 1),
+        "SAME",
+        dimension_numbers=("NHWC", "HWIO", "NHWC"),
+        precision=precision,
+    )[0]
+    return value + layer["bias"] if "bias" in layer else value
+
+
+def _filter(image: Array, logits: Array, size: int, mask: Array | None) -> Weighted:
+    if mask is None:
+        mask = jnp.ones((*image.shape[:2], 1), bool)
+    border = ((size // 2,) * 2, (size // 2,) * 2, (0, 0))
+    near = patches(jnp.pad(mask, border), size)[..., 0]
+    weights = jax.nn.softmax(jnp.where(near, logits, jnp.finfo(logits.dtype).min), axis=-1)
+    weights = jnp.where(mask, weights, 0)
+    around = patches(jnp.pad(image, border), size)
+    return Weighted(weights, image, (weights[..., None] * around).sum(-2))
+
+
+def patches(x: Float[Array, "*b h w c"], size: int) -> Float[Array, "*b h2 w2 taps c"]:
+    """The size×size pixels in raster order at every place where they all are inside x."""
+    height, width = (n - size + 1 for n in x.shape[-3:-1])
+    rows = jnp.stack([x[..., i : i + height, :, :] for i in range(size)], axis=-2)
+    both = jnp.stack([rows[..., j : j + width, :, :] for j in range(size)], axis=-2)
+    return both.reshape(*x.shape[:-3], height, width, size**2, x.shape[-1])
+
+
+def _not_bounded(nodes: Sequence[Node]) -> set[int]:
+    """Convolutions read by what does not zero padding beyond the image, where they are not zero."""
     return {
         source
         for node in nodes
-        if not isinstance(node, Relu)
+        if not isinstance(node, Relu | Pointwise)
         for source in sources(node)
         if isinstance(nodes[source], Conv)
     }
@@ -187,6 +294,20 @@ def children(x: Float[Array, "h w c"]) -> list[Float[Array, "h2 w2 c"]]:
     h, w, c = x.shape
     cells = x.reshape(h // 2, 2, w // 2, 2, c)
     return [cells[:, i, :, j] for i in (0, 1) for j in (0, 1)]
+
+
+def max_pool(x: Float[Array, "h w c"]) -> Float[Array, "h2 w2 c"]:
+    """The largest of each 2×2, whose derivative goes to the first of them in raster order on ties."""
+    best, *others = children(x)
+    for other in others:
+        best = jnp.where(other > best, other, best)
+    return best
+
+
+def upsample(x: Float[Array, "h w c"]) -> Float[Array, "2h 2w c"]:
+    """Each pixel repeated over 2×2."""
+    h, w, c = x.shape
+    return jnp.broadcast_to(x[:, None, :, None], (h, 2, w, 2, c)).reshape(2 * h, 2 * w, c)
 
 
 def _mask_pyramid(inside: Array | None, top: int) -> list[Array] | None:

@@ -5,7 +5,6 @@ at 0, perceptually uniform (PU) transfer; albedo clamped to [0, 1]; normals clam
 [0, 1]; zeros up to a multiple of 16; the U-Net; and the inverse of the colour's steps.
 """
 
-import dataclasses
 import functools
 import importlib.util
 from collections.abc import Callable
@@ -20,8 +19,15 @@ from jaxtyping import Array, Float
 
 from progden_jax import _checks, transfer
 from progden_jax.denoisers import unet
-from progden_jax.denoisers._base import Bound
-from progden_jax.denoisers.graph import Layered, Node
+from progden_jax.denoisers._network import (
+    Network,
+    Params,
+    Valid,
+    lit,
+    normal_to_unit,
+    run,
+)
+from progden_jax.denoisers.graph import Node
 from progden_jax.denoisers.tza import parse_tza
 from progden_jax.frame import Frame
 
@@ -41,12 +47,12 @@ NAMES = (
 
 
 @jax.tree_util.register_pytree_with_keys_class
-class OIDN:
+class OIDN(Network):
     """One of OIDN's networks for radiance: a pytree whose leaves are its weights and exposure.
 
     Parameters
     ----------
-    params : see `unet.Params`.
+    params : see `Params`.
     inputs : auxiliary buffers taken besides the colour: (), ("albedo",) or ("albedo", "normal").
     exposure : what radiance is multiplied by before the transfer function (OIDN's inputScale), or None:
         found from each frame's log-average luminance, as OIDN does. A constant in derivatives.
@@ -54,208 +60,45 @@ class OIDN:
     precision : of the convolutions; "highest" keeps float32 on GPUs, "tensorfloat32" is about 1e-3 off.
     """
 
-    canvas = True
+    leaves = ("params", "exposure")
 
     def __init__(
         self,
-        params: unet.Params,
+        params: Params,
         inputs: tuple[str, ...] = (),
         *,
         exposure: float | Array | None = None,
         name: str = "oidn",
         precision: str = "highest",
     ) -> None:
-        first = next(iter(unet.layout(params)[0][0]))
-        taken, expected = params[first]["kernel"].shape[2], 3 * (1 + len(inputs))
-        if taken != expected:
-            raise ValueError(
-                f"the weights of {name} take {taken} input channels; radiance with "
-                f"{' and '.join(inputs) or 'nothing else'} makes {expected}."
-            )
-        self.params = params
-        self.inputs = inputs
+        super().__init__(params, inputs, name=name, precision=precision)
         self.exposure = exposure
-        self.name = name
-        self.precision = precision
 
-    def __call__(self, frame: Frame) -> Float[Array, "h w 3"]:
-        """The denoised image, (H, W, 3) linear radiance, at least 0.
+    @property
+    def nodes(self) -> tuple[Node, ...]:
+        return unet.graph(self.params)
 
-        Raises
-        ------
-        ValueError
-            If the frame is no single image, or lacks a buffer that the network takes.
-        """
-        return _jitted_call(self, frame)
+    def encode(self, x: Array, exposure: Array) -> Array:
+        return transfer.pu_hdr(lit(x * exposure))
 
-    def bind(self, frame: Frame, *, valid: tuple[Array | int, Array | int] | None = None) -> Bound:
-        """f with y = f(x) for the frame's auxiliary buffers and exposure; a pytree, so it passes through jit.
+    def decode(self, y: Array, exposure: Array) -> Array:
+        return transfer.pu_hdr_inverse(y) / exposure
 
-        `valid` is the true (height, width), may be traced, of a frame padded beyond it with zeros.
-        """
-        _checks.image("frame.color", frame.color)
-        auxiliary = []
-        for name in self.inputs:
-            buffer = getattr(frame, name)
-            if buffer is None:
-                raise ValueError(
-                    f"{self.name} takes {' and '.join(self.inputs)}, and this frame has no {name}: "
-                    "choose a network with fewer inputs, such as 'oidn-hdr', or give the buffer."
-                )
-            buffer = jnp.nan_to_num(buffer, nan=0.0)
-            if name == "normal":
-                auxiliary.append(jnp.clip(buffer, -1, 1) * 0.5 + 0.5)
-            else:
-                auxiliary.append(jnp.clip(buffer, 0, 1))
+    def transferred(self, role: str, buffer: Array) -> Array:
+        return normal_to_unit(buffer) if role == "normal" else jnp.clip(buffer, 0, 1)
+
+    def exposure_of(self, frame: Frame, valid: Valid) -> Array:
         exposure = self.exposure
         if exposure is None:
             exposure = autoexposure(frame.color, valid=valid)
-        exposure = lax.stop_gradient(jnp.asarray(exposure, frame.color.dtype))
-        return BoundOIDN(self, tuple(auxiliary), exposure, valid)
-
-    @property
-    def receptive_radius(self) -> int:
-        """How many pixels away an output pixel can depend on the input."""
-        return unet.receptive_radius(self.params)
+        return lax.stop_gradient(jnp.asarray(exposure, frame.color.dtype))
 
     def __repr__(self) -> str:
         return f"OIDN({self.name!r}, inputs={self.inputs}, exposure={self.exposure})"
 
-    def tree_flatten_with_keys(self) -> tuple[list[tuple[Any, Any]], Any]:
-        keys = (jax.tree_util.GetAttrKey("params"), jax.tree_util.GetAttrKey("exposure"))
-        children, static = self.tree_flatten()
-        return list(zip(keys, children, strict=True)), static
-
-    def tree_flatten(self) -> tuple[tuple[Any, Any], Any]:
-        return (self.params, self.exposure), (self.inputs, self.name, self.precision)
-
-    @classmethod
-    def tree_unflatten(cls, static: Any, children: Any) -> "OIDN":
-        denoiser = object.__new__(cls)
-        denoiser.params, denoiser.exposure = children
-        denoiser.inputs, denoiser.name, denoiser.precision = static
-        return denoiser
-
 
 @jax.jit
-def _jitted_call(denoiser: OIDN, frame: Frame) -> Array:
-    return denoiser.bind(frame)(frame.color)
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class BoundOIDN:
-    """y = f(x) for one frame: what `OIDN.bind` gives."""
-
-    denoiser: OIDN
-    auxiliary: tuple[Array, ...]
-    exposure: Array
-    valid: tuple[Array | int, Array | int] | None
-
-    def __call__(self, x: Float[Array, "h w 3"]) -> Float[Array, "h w 3"]:
-        """The denoised image, (H, W, 3) linear radiance."""
-        _checks.image("x", x)
-        return _run_bound(self, x)
-
-    @property
-    def receptive_radius(self) -> int:
-        """How many pixels away an output pixel can depend on the input."""
-        return self.denoiser.receptive_radius
-
-    @property
-    def alignment(self) -> int:
-        """Pixels after which the way that outputs depend on inputs repeats."""
-        return unet.ALIGNMENT
-
-    @property
-    def layers(self) -> tuple[tuple[Node, ...], unet.Params]:
-        """The network's graph and parameters."""
-        return unet.graph(self.denoiser.params), self.denoiser.params
-
-    def layered(self, x: Float[Array, "h w 3"]) -> Layered:
-        """f taken apart at x, for algorithms that look inside the network."""
-        encoded, slope = jax.jvp(self._encode, (x,), (jnp.ones_like(x),))
-        inputs = jnp.concatenate((encoded, *self.auxiliary), axis=-1)
-        inside = _inside(x.shape[:2], self.valid)
-        if inside is not None:
-            inputs, slope = jnp.where(inside, inputs, 0), jnp.where(inside, slope, 0)
-        inputs = _pad_to_alignment(inputs)
-        aligned = _inside(inputs.shape[:2], _aligned(self.valid))
-        params = self.denoiser.params
-        return Layered(unet.graph(params), params, inputs, aligned, slope, self._decode)
-
-    def _encode(self, x: Array) -> Array:
-        radiance = x * self.exposure
-        # At exactly 0 the derivative is the one from the right: black pixels respond to light.
-        radiance = jnp.where((radiance < 0) | jnp.isnan(radiance), 0, radiance)
-        return transfer.pu_hdr(radiance)
-
-    def _decode(self, y: Array) -> Array:
-        return transfer.pu_hdr_inverse(y) / self.exposure
-
-
-@jax.jit
-def _run_bound(f: BoundOIDN, x: Array) -> Array:
-    inside = _inside(x.shape[:2], f.valid)
-    y = run_unet(
-        f.denoiser.params,
-        (f._encode(x), *f.auxiliary),
-        inside=inside,
-        valid=f.valid,
-        precision=f.denoiser.precision,
-    )
-    y = f._decode(y)
-    return y if inside is None else jnp.where(inside, y, 0)
-
-
-Valid = tuple[Array | int, Array | int] | None
-
-
-def _inside(shape: tuple[int, ...], valid: Valid) -> Array | None:
-    if valid is None:
-        return None
-    rows, columns = (jnp.arange(n) < v for n, v in zip(shape, valid, strict=True))
-    return (rows[:, None] & columns[None, :])[..., None]
-
-
-def _aligned(valid: Valid) -> Valid:
-    if valid is None:
-        return None
-    size = unet.ALIGNMENT
-    return (valid[0] + size - 1) // size * size, (valid[1] + size - 1) // size * size
-
-
-def _pad_to_alignment(x: Array) -> Array:
-    return jnp.pad(
-        x, ((0, -x.shape[0] % unet.ALIGNMENT), (0, -x.shape[1] % unet.ALIGNMENT), (0, 0))
-    )
-
-
-def run_unet(
-    params: unet.Params,
-    channels: tuple[Float[Array, "h w 3"], ...],
-    *,
-    inside: Array | None = None,
-    valid: tuple[Array | int, Array | int] | None = None,
-    precision: str = "highest",
-) -> Float[Array, "h w 3"]:
-    """The network on transferred channels of any size, padded with zeros as OIDN pads and cropped again."""
-    x = jnp.concatenate(channels, axis=-1)
-    if inside is not None:
-        x = jnp.where(inside, x, 0)
-    y = unet.apply(
-        params,
-        _pad_to_alignment(x),
-        valid=_aligned(valid),
-        precision=lax.Precision.HIGHEST if precision == "highest" else cast(Any, precision),
-    )
-    return y[: x.shape[0], : x.shape[1]]
-
-
-@jax.jit
-def autoexposure(
-    color: Float[Array, "h w 3"], *, valid: tuple[Array | int, Array | int] | None = None
-) -> Float[Array, ""]:
+def autoexposure(color: Float[Array, "h w 3"], *, valid: Valid = None) -> Float[Array, ""]:
     """0.18 / 2^mean(log2 L) over bins of about 16×16 pixels of mean luminance L > 1e-8; 1 for a black image.
 
     `valid` is the true (height, width), may be traced, of an image padded beyond it.
@@ -300,19 +143,17 @@ _PREFILTERS = {
         lambda a: transfer.srgb(jnp.clip(a, 0, 1)),
         lambda y: transfer.srgb_inverse(jnp.clip(y, 0, 1)),
     ),
-    "normal": _Prefilter(
-        lambda n: jnp.clip(n, -1, 1) * 0.5 + 0.5, lambda y: jnp.clip(y * 2 - 1, -1, 1)
-    ),
+    "normal": _Prefilter(normal_to_unit, lambda y: jnp.clip(y * 2 - 1, -1, 1)),
 }
 
 
 @functools.partial(jax.jit, static_argnames="role")
-def prefilter_buffer(params: unet.Params, buffer: Float[Array, "h w 3"], *, role: str) -> Array:
+def prefilter_buffer(params: Params, buffer: Float[Array, "h w 3"], *, role: str) -> Array:
     """An albedo or normal buffer, (H, W, 3), denoised by OIDN's network for it."""
     _checks.choice("role", role, _PREFILTERS)
     _checks.image(role, buffer)
     encode, decode = _PREFILTERS[role]
-    return decode(run_unet(params, (encode(jnp.nan_to_num(buffer, nan=0.0)),)))
+    return decode(run(unet.graph(params), params, (encode(jnp.nan_to_num(buffer, nan=0.0)),)))
 
 
 @functools.cache

@@ -1,4 +1,4 @@
-"""The U-Net of Open Image Denoise 2.x as a pure function of (params, inputs).
+"""The U-Net of Open Image Denoise 2.x: its layers, their sizes and their names in archives.
 
 Two layouts of weights are known. Base and small have one convolution per encoder level, large has two; which
 one it is follows from the names of the layers. Every convolution is 3×3 with zero padding and is
@@ -6,22 +6,12 @@ followed by a ReLU, the last one too; 2×2 max pooling down, nearest neighbour u
 pooled levels and from the input.
 """
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
 
-import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jaxtyping import Array, Bool, Float
 
+from progden_jax.denoisers._network import Params
 from progden_jax.denoisers.graph import Conv, Input, MaxPool, Node, Relu, Upsample
-
-Params = Mapping[str, Mapping[str, Any]]
-"""Layer name -> {"kernel": (3, 3, in, out), "bias": (out,)}."""
-
-LEVELS = 4
-ALIGNMENT = 2**LEVELS
-"""Inputs are padded with zeros to multiples of this many pixels."""
 
 _BASE = (
     (("enc_conv0", "enc_conv1"), ("enc_conv2",), ("enc_conv3",), ("enc_conv4",)),
@@ -43,8 +33,30 @@ _LARGE = (
 )
 
 
+_WIDTHS = {
+    "small": (_BASE, (*[32] * 7, *[64] * 5, *[32] * 3, 3)),
+    "base": (
+        _BASE,
+        (32, 32, 48, 64, 80, 96, 96, 112, 112, 96, 96, 64, 64, 64, 32, 3),
+    ),
+    "large": (
+        _LARGE,
+        (*(64, 64, 96, 96, 128, 128, 192, 192, 256, 256, 192, 192, 128, 128, 96, 96), 64, 64, 3),
+    ),
+}
+
+SIZES = tuple(_WIDTHS)
+"""OIDN's three sizes: 0.3, 0.9 and 3.8 million weights."""
+
+
+def shapes(size: str) -> dict[str, tuple[int, int]]:
+    """Of every layer of a network of that size, in order, the kernel's edge and its output channels."""
+    candidate, widths = _WIDTHS[size]
+    return {name: (3, width) for name, width in zip(_layers(candidate), widths, strict=True)}
+
+
 def layout(
-    params: Params,
+    params: Iterable[str],
 ) -> tuple[tuple[tuple[str, ...], ...], tuple[str, ...], tuple[tuple[str, ...], ...]]:
     """Names of the layers per encoder level, at the bottom, and per decoder level.
 
@@ -54,74 +66,21 @@ def layout(
         If the layers are neither those of the base and small nor those of the large network.
     """
     for candidate in (_BASE, _LARGE):
-        encoder, bottom, decoder = candidate
-        names = {name for level in (*encoder, bottom, *decoder) for name in level}
-        if names == set(params):
+        if set(_layers(candidate)) == set(params):
             return candidate
     raise ValueError(
         f"the weights hold the layers {', '.join(sorted(params))}; expected those of OIDN's U-Net "
-        f"(base and small: {_names(_BASE)}; large: {_names(_LARGE)})."
+        f"(base and small: {', '.join(_layers(_BASE))}; large: {', '.join(_layers(_LARGE))})."
     )
 
 
-def _names(candidate: Sequence) -> str:
+def _layers(candidate: Sequence) -> list[str]:
     encoder, bottom, decoder = candidate
-    return ", ".join(name for level in (*encoder, bottom, *decoder) for name in level)
+    return [name for level in (*encoder, bottom, *decoder) for name in level]
 
 
-def apply(
-    params: Params,
-    inputs: Float[Array, "h w c"],
-    *,
-    valid: tuple[Array | int, Array | int] | None = None,
-    precision: lax.PrecisionLike = lax.Precision.HIGHEST,
-) -> Float[Array, "h w 3"]:
-    """The network's output, (H, W, 3) and at least 0, in the transferred space of its input.
-
-    Parameters
-    ----------
-    params : see `Params`.
-    inputs : (H, W, C) transferred colour and auxiliary channels; H and W multiples of 16.
-    valid : (height, width), multiples of 16, at most (H, W), may be traced: what lies outside counts as the
-        zero padding around an image of this size, so that one compiled program serves many sizes.
-    precision : of the convolutions. The default keeps float32 on GPUs, where JAX else takes TF32.
-    """
-    encoder, bottom, decoder = layout(params)
-    masks = [_mask(inputs.shape[0] >> n, inputs.shape[1] >> n, valid, n) for n in range(LEVELS + 1)]
-
-    def convolve(name: str, x: Array, level: int) -> Array:
-        x = lax.conv_general_dilated(
-            x[None],
-            params[name]["kernel"],
-            (1, 1),
-            "SAME",
-            dimension_numbers=("NHWC", "HWIO", "NHWC"),
-            precision=precision,
-        )[0]
-        x = x + params[name]["bias"]
-        positive = x > 0
-        if (mask := masks[level]) is not None:
-            positive &= mask
-        return jnp.where(positive, x, 0)
-
-    x, skips = inputs, [inputs]
-    for level, names in enumerate(encoder):
-        for name in names:
-            x = convolve(name, x, level)
-        x = max_pool(x)
-        skips.append(x)
-    skips.pop()
-    for name in bottom:
-        x = convolve(name, x, LEVELS)
-    for level, names in zip(reversed(range(LEVELS)), decoder, strict=True):
-        x = jnp.concatenate([upsample(x), skips[level]], axis=-1)
-        for name in names:
-            x = convolve(name, x, level)
-    return x
-
-
-def graph(params: Params) -> tuple[Node, ...]:
-    """The network as a list of layers, for the exact divergence by cones."""
+def graph(params: Iterable[str]) -> tuple[Node, ...]:
+    """The network of those layers."""
     encoder, bottom, decoder = layout(params)
     nodes: list[Node] = [Input()]
 
@@ -143,48 +102,6 @@ def graph(params: Params) -> tuple[Node, ...]:
         nodes.append(Upsample(x))
         x = convolve(names, len(nodes) - 1, skip)
     return tuple(nodes)
-
-
-def max_pool(x: Float[Array, "h w c"]) -> Float[Array, "h2 w2 c"]:
-    """The largest of each 2×2, whose derivative goes to the first of them in raster order on ties."""
-    h, w, c = x.shape
-    cells = x.reshape(h // 2, 2, w // 2, 2, c)
-    candidates = [cells[:, i, :, j] for i in (0, 1) for j in (0, 1)]
-    best = candidates[0]
-    for candidate in candidates[1:]:
-        best = jnp.where(candidate > best, candidate, best)
-    return best
-
-
-def upsample(x: Float[Array, "h w c"]) -> Float[Array, "2h 2w c"]:
-    """Each pixel repeated over 2×2."""
-    h, w, c = x.shape
-    return jnp.broadcast_to(x[:, None, :, None], (h, 2, w, 2, c)).reshape(2 * h, 2 * w, c)
-
-
-def _mask(
-    height: int, width: int, valid: tuple[Array | int, Array | int] | None, level: int
-) -> Bool[Array, "h w 1"] | None:
-    if valid is None:
-        return None
-    rows = jnp.arange(height) < jnp.asarray(valid[0]) >> level
-    columns = jnp.arange(width) < jnp.asarray(valid[1]) >> level
-    return (rows[:, None] & columns[None, :])[..., None]
-
-
-def receptive_radius(params: Params) -> int:
-    """How many pixels away the input can be that an output pixel depends on."""
-    encoder, bottom, decoder = layout(params)
-    radius = 0
-    for level, names in (
-        *enumerate(encoder),
-        (LEVELS, bottom),
-        *zip(reversed(range(LEVELS)), decoder, strict=True),
-    ):
-        for name in names:
-            radius += (np.shape(params[name]["kernel"])[0] // 2) << level
-    # Each pooling step, and the blocks it fixes in place, reach one level's pixel further.
-    return radius + sum(1 << level for level in range(LEVELS))
 
 
 def from_tensors(tensors: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
@@ -211,11 +128,9 @@ def from_tensors(tensors: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.nd
 
 def to_tensors(params: Params, dtype: np.typing.DTypeLike = np.float16) -> dict[str, np.ndarray]:
     """The tensors of a TZA archive from parameters: the inverse of `from_tensors` but for `dtype`."""
-    encoder, bottom, decoder = layout(params)
     tensors = {}
-    for level in (*encoder, bottom, *decoder):
-        for name in level:
-            kernel = np.asarray(params[name]["kernel"], dtype)
-            tensors[f"{name}.weight"] = np.transpose(kernel, (3, 2, 0, 1))
-            tensors[f"{name}.bias"] = np.asarray(params[name]["bias"], dtype)
+    for name in _layers(layout(params)):
+        kernel = np.asarray(params[name]["kernel"], dtype)
+        tensors[f"{name}.weight"] = np.transpose(kernel, (3, 2, 0, 1))
+        tensors[f"{name}.bias"] = np.asarray(params[name]["bias"], dtype)
     return tensors

@@ -9,7 +9,6 @@ windows and form one batch; offsets that differ between phases are traced, so on
 
 import dataclasses
 import functools
-import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -68,6 +67,10 @@ def plan(nodes: Sequence[g.Node], params: Any) -> Plan:
                 span = None if spans[0] is None else spans[0] >> 1
             case g.Upsample():
                 span = None if spans[0] is None else 2 * spans[0] + np.array([[0], [1]])
+            case g.Filter():
+                image, r = forward[node.image], node.size // 2
+                reached = None if image is None else image + np.array([[-r], [r]])
+                span = _union([reached, forward[node.logits]])
             case _:
                 span = _union(spans)
         forward.append(span)
@@ -86,6 +89,10 @@ def plan(nodes: Sequence[g.Node], params: Any) -> Plan:
                 needed = 2 * span + np.array([[0], [1]])
             case g.Upsample():
                 needed = span >> 1
+            case g.Filter():
+                needed, r = span, node.size // 2
+                around = span + np.array([[-r], [r]])
+                backward[node.image] = _union([backward[node.image], around])
             case _:
                 needed = span
         for source in g.sources(node):
@@ -143,23 +150,9 @@ def multiply_adds(plan: Plan, params: Any) -> float:
 
 def _split(plan: Plan, params: Any, node: g.Conv) -> list[slice]:
     """The input channels of a convolution that belong to each of its sources."""
-    widths = [_channels(plan.nodes, params, source) for source in node.sources]
-    known = sum(w for w in widths if w is not None)
-    total = params[node.layer]["kernel"].shape[2]
-    starts = np.cumsum([0, *(total - known if w is None else w for w in widths)])
-    return [slice(int(a), int(b)) for a, b in itertools.pairwise(starts)]
-
-
-def _channels(nodes: Sequence[g.Node], params: Any, index: int) -> int | None:
-    """The channels of a node; None for the input, which the convolutions' weights tell."""
-    node = nodes[index]
-    match node:
-        case g.Input():
-            return None
-        case g.Conv():
-            return params[node.layer]["kernel"].shape[3]
-        case _:
-            return _channels(nodes, params, g.sources(node)[0])
+    widths = g.channels(plan.nodes, params)
+    ends = np.cumsum([widths[source] for source in node.sources])
+    return [slice(int(e) - widths[s], int(e)) for e, s in zip(ends, node.sources, strict=True)]
 
 
 def _taps(size: int) -> range:
@@ -190,7 +183,7 @@ class Sweep:
         self,
         plan: Plan,
         params: Any,
-        kept: dict[int, Array],
+        kept: dict[int, Any],
         phase: tuple[Array, Array],
         cells: tuple[Array, Array],
         precision: Any,
@@ -206,10 +199,13 @@ class Sweep:
             window = plan.windows[index]
             if window is None:
                 continue
+            read = functools.partial(self._read, values, window)
             match node:
                 case g.Input():
                     number = self.cells[0].shape[0]
-                    unit = jnp.eye(3, self._input_channels(), dtype=self._dtype())
+                    unit = jnp.eye(
+                        3, g.input_channels(self.plan.nodes, self.params), dtype=self._dtype()
+                    )
                     value = jnp.broadcast_to(
                         unit[None, :, None, None], (number, 3, 1, 1, unit.shape[1])
                     )
@@ -217,24 +213,27 @@ class Sweep:
                 case g.Conv():
                     value = self._convolve(node, window, values)
                     if index in self.kept:
-                        value = self._scale(
-                            value, self._around(self.kept[index], index, window, False)
-                        )
+                        value = self._scale(value, self._slope(index, window))
                 case g.Relu():
-                    value = self._scale(
-                        values[node.source], self._around(self.kept[index], index, window, False)
-                    )
+                    value = self._scale(read(node.source), self._slope(index, window))
+                case g.LeakyRelu():
+                    slope = self.params[node.layer]["slope"]
+                    slope = jnp.where(self._slope(index, window), 1, slope)
+                    value = self._scale(read(node.source), slope)
+                case g.Affine():
+                    value = read(node.source) * self.params[node.layer]["scale"]
+                case g.Pointwise():
+                    value = read(node.source)[..., : node.channels]
+                    value = self._scale(value, self._slope(index, window))
                 case g.MaxPool():
                     value = self._pool(index, node, window, values[node.source])
                 case g.Upsample():
                     value = values[node.source]  # Read by convolutions, which repeat it themselves.
                 case g.Add():
-                    parts = [
-                        self._move(values[s], self._window(s), window)
-                        for s in node.sources
-                        if s in values
-                    ]
+                    parts = [read(s) for s in node.sources if s in values]
                     value = parts[0] if len(parts) == 1 else parts[0] + parts[1]
+                case g.Filter():
+                    value = self._filter(index, node, window, values)
             values[index] = value
         last = values[len(plan.nodes) - 1]
         return last.reshape(-1, 3, last.shape[-1])
@@ -242,17 +241,14 @@ class Sweep:
     def _dtype(self) -> Any:
         return jax.tree.leaves(self.params)[0].dtype
 
-    def _input_channels(self) -> int:
-        """As many as the first convolution of the input takes."""
-        for node in self.plan.nodes:
-            if isinstance(node, g.Conv) and node.sources == (0,):
-                return self.params[node.layer]["kernel"].shape[2]
-        raise ValueError("no convolution of the graph reads the input alone.")
-
     def _window(self, index: int) -> Window:
         window = self.plan.windows[index]
         assert window is not None
         return window
+
+    def _read(self, values: dict[int, Array], window: Window, source: int) -> Array:
+        """A node's tangents in the window of one that reads it, which may be narrower."""
+        return self._move(values[source], self._window(source), window)
 
     def _convolve(self, node: g.Conv, window: Window, values: dict[int, Array]) -> Array:
         kernel = self.params[node.layer]["kernel"]
@@ -426,7 +422,35 @@ class Sweep:
         assert total is not None
         return total
 
-    def _around(self, kept: Array, index: int, window: Window, outside: int | bool) -> Array:
+    def _filter(
+        self, index: int, node: g.Filter, window: Window, values: dict[int, Array]
+    ) -> Array:
+        """Σ_q w_q dx_q + w_q (x_q − y) dℓ_q over the taps q, w the softmax of the logits ℓ."""
+        kept = self.kept[index]
+        wide = Window(window.origin - node.size // 2, window.size + node.size - 1)
+        weights = self._around(kept.weights, index, window, 0)[..., None]
+        around = g.patches(self._around(kept.image, index, wide, 0), node.size)
+        away = weights * (around - self._around(kept.result, index, window, 0)[..., None, :])
+        parts = []
+        if node.image in values:
+            image = self._per_cell(self._read(values, wide, node.image))
+            parts.append((weights[:, None] * g.patches(image, node.size)).sum(-2))
+        if node.logits in values:
+            logits = self._per_cell(self._read(values, window, node.logits))
+            product = jnp.einsum("nhwtc,ndhwt->ndhwc", away, logits, precision=self.precision)
+            parts.append(product)
+        total = parts[0] if len(parts) == 1 else parts[0] + parts[1]
+        return total.reshape(-1, *total.shape[2:])
+
+    def _per_cell(self, x: Array) -> Array:
+        """(cells·3, ...) as (cells, 3, ...)."""
+        return x.reshape(self.cells[0].shape[0], -1, *x.shape[1:])
+
+    def _slope(self, index: int, window: Window) -> Array:
+        """What the primal pass kept of a pointwise layer, 0 or False beyond the image."""
+        return self._around(self.kept[index], index, window, 0)
+
+    def _around(self, kept: Array, index: int, window: Window, outside: int) -> Array:
         """What the primal pass kept, in every cell's window: (cells, s, s, C)."""
         level, s = self.plan.levels[index], window.size
         reach = 2 * s + int(np.abs(window.origin).max())
@@ -439,10 +463,11 @@ class Sweep:
         cut = functools.partial(lax.dynamic_slice, slice_sizes=(s, s, kept.shape[-1]))
         return jax.vmap(lambda row, column: cut(padded, (row, column, 0)))(*corner)
 
-    def _scale(self, x: Array, passes: Array) -> Array:
-        cells = passes.shape[0]
-        split = x.reshape(cells, -1, *x.shape[1:])
-        return jnp.where(passes[:, None], split, 0).reshape(x.shape)
+    def _scale(self, x: Array, slope: Array) -> Array:
+        """The tangents of every cell times a slope, or where it is a mask, kept."""
+        split, slope = self._per_cell(x), slope[:, None]
+        scaled = jnp.where(slope, split, 0) if slope.dtype == bool else slope * split
+        return scaled.reshape(x.shape)
 
 
 def _interleave(first: Any, second: Any, axis: int, size: int) -> Array:
@@ -460,7 +485,7 @@ def _interleave(first: Any, second: Any, axis: int, size: int) -> Array:
 def jacobian_diagonal(
     plan: Plan,
     params: Any,
-    kept: dict[int, Array],
+    kept: dict[int, Any],
     size: tuple[int, int],
     *,
     chunk: int,
@@ -487,7 +512,7 @@ def assemble(rows: Array, size: tuple[int, int], period: int) -> Float[Array, "h
 def phase_diagonal(
     plan: Plan,
     params: Any,
-    kept: dict[int, Array],
+    kept: dict[int, Any],
     size: tuple[int, int],
     index: Array,
     *,

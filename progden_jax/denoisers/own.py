@@ -1,0 +1,239 @@
+"""The project's own denoisers, trained from scratch: a U-Net and a kernel-predicting network.
+
+Both see log(1 + v) / log(65505) of radiance and albedo, normals moved to [0, 1] and the arctangent of
+the variance, and no exposure is sought (Firmino et al. 2022, section 5.1, has none). The variance
+is a constant in derivatives with respect to the colour, as albedo and normal are: SURE's divergence is that
+of y = f(x) at fixed σ².
+"""
+
+import functools
+import math
+from typing import Any, Self
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from progden_jax import _checks, transfer
+from progden_jax.denoisers import unet
+from progden_jax.denoisers._network import (
+    Network,
+    Params,
+    he_params,
+    lit,
+    normal_to_unit,
+)
+from progden_jax.denoisers.graph import Conv, Filter, Input, Node, Pointwise, Relu
+
+INPUT_SETS: dict[str, tuple[str, ...]] = {
+    "hdr": (),
+    "hdr-var": ("variance",),
+    "hdr-alb-nrm": ("albedo", "normal"),
+    "hdr-alb-nrm-var": ("albedo", "normal", "variance"),
+}
+"""The paper's input sets (Table 1): what each takes besides the colour."""
+
+BUFFERS = ("albedo", "normal", "variance")
+
+_LOG_GAIN = math.log(65505) / math.log(2)
+"""Brings the transferred radiance 1, which is 1/16, to the size of about 1 that He's weights expect."""
+
+
+class _Own(Network):
+    """A network between log(1 + ·) transfers."""
+
+    def __init__(
+        self, params: Params, inputs: tuple[str, ...], *, name: str, precision: str
+    ) -> None:
+        for role in inputs:
+            _checks.choice("inputs", role, BUFFERS)
+        super().__init__(params, tuple(inputs), name=name, precision=precision)
+
+    def encode(self, x: Array, exposure: None) -> Array:
+        del exposure
+        return transfer.log1p_normalized(lit(x))
+
+    def transferred(self, role: str, buffer: Array) -> Array:
+        if role == "normal":
+            return normal_to_unit(buffer)
+        return (transfer.arctan if role == "variance" else transfer.log1p_normalized)(lit(buffer))
+
+
+def _gains(inputs: tuple[str, ...]) -> list[float]:
+    """Of every input channel, see `he_params`: logarithms alone are far from 1."""
+    return [gain for role in ("color", *inputs) for gain in [_GAINS.get(role, 1.0)] * 3]
+
+
+_GAINS = {"color": _LOG_GAIN, "albedo": _LOG_GAIN}
+
+
+def _quietened(params: dict[str, Any], layer: str, bias: float) -> dict[str, Any]:
+    """A tenth of that layer's kernel, and its bias: the network starts near a constant output."""
+    last = params[layer]
+    changed = {"kernel": 0.1 * last["kernel"], "bias": jnp.full_like(last["bias"], bias)}
+    return params | {layer: changed}
+
+
+@jax.tree_util.register_pytree_with_keys_class
+class UNet(_Own):
+    """OIDN's U-Net with weights of its own, from and to log(1 + radiance): a pytree of its weights.
+
+    Parameters
+    ----------
+    params : layers as of OIDN's networks, see `unet.shapes`.
+    inputs : buffers taken besides the colour, in this order: some of "albedo", "normal" and "variance".
+    name : for messages.
+    precision : of the convolutions; "highest" keeps float32 on GPUs, "tensorfloat32" is about 1e-3 off.
+
+    References
+    ----------
+    Firmino et al. 2022, section 5.1.
+    """
+
+    def __init__(
+        self,
+        params: Params,
+        inputs: tuple[str, ...] = (),
+        *,
+        name: str = "unet",
+        precision: str = "highest",
+    ) -> None:
+        super().__init__(params, inputs, name=name, precision=precision)
+
+    @classmethod
+    def init(
+        cls,
+        key: jax.Array,
+        inputs: tuple[str, ...] = (),
+        *,
+        size: str = "base",
+        name: str = "unet",
+        precision: str = "highest",
+    ) -> Self:
+        """A network to train: He's random weights, zero biases.
+
+        The first layer allows for logarithms that are a sixteenth at radiance 1. The last has a tenth of
+        its weights and a bias that stands for radiance 0.74, because a ReLU follows: a
+        channel that began negative everywhere would never learn.
+
+        Parameters
+        ----------
+        key : of the random numbers.
+        inputs : see `UNet`; `INPUT_SETS` has the paper's.
+        size : "small", "base" or "large": 0.3, 0.9 or 3.8 million weights.
+        """
+        _checks.choice("size", size, unet.SIZES)
+        shapes = unet.shapes(size)
+        params = he_params(key, unet.graph(shapes), shapes, _gains(inputs))
+        params = _quietened(params, list(shapes)[-1], 0.05)
+        return cls(params, inputs, name=name, precision=precision)
+
+    @property
+    def nodes(self) -> tuple[Node, ...]:
+        return unet.graph(self.params)
+
+    def decode(self, y: Array, exposure: None) -> Array:
+        del exposure
+        return transfer.log1p_normalized_inverse(y)
+
+
+@jax.tree_util.register_pytree_with_keys_class
+class KPCN(_Own):
+    """A network that predicts for every pixel the kernel which filters the radiance around it.
+
+    Convolutions with ReLUs end in one logit per tap; y_p = Σ_q w_pq x_q with w their softmax, over the
+    pixels inside the image, x the linear radiance at least 0, the three channels alike. So y is between the
+    least and the most of its neighbourhood.
+
+    Parameters
+    ----------
+    params : layers "conv1", "conv2", ... and "kernel", whose output channels are an odd number squared.
+    inputs, name, precision : see `UNet`.
+
+    References
+    ----------
+    Firmino et al. 2022, section 6 (5×5 kernels); Bako et al. 2017. How the kernels are applied is not said
+    there; on linear radiance, a mean stays a mean.
+    """
+
+    def __init__(
+        self,
+        params: Params,
+        inputs: tuple[str, ...] = (),
+        *,
+        name: str = "kpcn",
+        precision: str = "highest",
+    ) -> None:
+        _kpcn_layers(params)
+        super().__init__(params, inputs, name=name, precision=precision)
+
+    @classmethod
+    def init(
+        cls,
+        key: jax.Array,
+        inputs: tuple[str, ...] = (),
+        *,
+        layers: int = 6,
+        width: int = 80,
+        layer_size: int = 5,
+        kernel_size: int = 5,
+        name: str = "kpcn",
+        precision: str = "highest",
+    ) -> Self:
+        """A network to train: He's random weights, zero biases, kernels near a box at first.
+
+        Parameters
+        ----------
+        key : of the random numbers.
+        inputs : see `UNet`; `INPUT_SETS` has the paper's.
+        layers, width, layer_size : convolutions before the one that predicts kernels, their channels
+            and the edge of their kernels in pixels, odd.
+        kernel_size : edge in pixels of the predicted kernels, odd.
+        """
+        _checks.positive_int("layers", layers)
+        _checks.positive_int("width", width)
+        _checks.odd_int("layer_size", layer_size)
+        _checks.odd_int("kernel_size", kernel_size)
+        shapes = {f"conv{n}": (layer_size, width) for n in range(1, layers + 1)}
+        shapes["kernel"] = (layer_size, kernel_size**2)
+        nodes = _kpcn_graph(layers, kernel_size)
+        params = _quietened(he_params(key, nodes, shapes, _gains(inputs)), "kernel", 0.0)
+        return cls(params, inputs, name=name, precision=precision)
+
+    @property
+    def nodes(self) -> tuple[Node, ...]:
+        taps = self.params["kernel"]["kernel"].shape[3]
+        return _kpcn_graph(len(self.params) - 1, math.isqrt(taps))
+
+    def decode(self, y: Array, exposure: None) -> Array:
+        del exposure
+        return y
+
+
+@functools.cache
+def _kpcn_graph(layers: int, size: int) -> tuple[Node, ...]:
+    nodes: list[Node] = [Input()]
+    for number in range(1, layers + 1):
+        nodes += [Conv((len(nodes) - 1,), f"conv{number}"), Relu(len(nodes))]
+    nodes.append(Conv((len(nodes) - 1,), "kernel"))
+    nodes.append(Pointwise(0, transfer.log1p_normalized_inverse, channels=3))
+    nodes.append(Filter(image=len(nodes) - 1, logits=len(nodes) - 2, size=size))
+    return tuple(nodes)
+
+
+def _kpcn_layers(params: Params) -> None:
+    expected = {"kernel", *(f"conv{n}" for n in range(1, len(params)))}
+    if len(params) < 2 or set(params) != expected:
+        raise ValueError(
+            f"the weights hold the layers {', '.join(sorted(params))}; expected those of a KPCN: "
+            "conv1, conv2, ... and kernel."
+        )
+    taps = params["kernel"]["kernel"].shape[3]
+    if math.isqrt(taps) ** 2 != taps or taps % 2 == 0:
+        raise ValueError(
+            f"the layer kernel predicts {taps} logits per pixel; expected an odd number squared, such as 25."
+        )
+
+
+ARCHITECTURES: dict[str, type[UNet] | type[KPCN]] = {"unet": UNet, "kpcn": KPCN}
+"""By the name that weight files use."""
