@@ -19,7 +19,17 @@ from jax.sharding import Mesh
 import progden_jax as pd
 from progden_jax import mixers
 from progden_jax.cli import main
-from progden_jax.training import MixerConfig, MixerTask, Trainer, config, losses, order, train
+from progden_jax.training import (
+    DenoiserConfig,
+    DenoiserTask,
+    MixerConfig,
+    MixerTask,
+    Trainer,
+    config,
+    losses,
+    order,
+    train,
+)
 from progden_jax.training import augment as augmenting
 from progden_jax.training.estimates import EstimateCache
 from progden_jax.training.index import index, split
@@ -634,6 +644,38 @@ def train_on_devices(folder: str) -> None:
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), one, two)
     assert one[0]["slope"] > 0
     Path(folder, "done").touch()
+
+
+@pytest.mark.parametrize("loss", ["smape", "sure"])
+def test_training_a_denoiser(folder, tmp_path, loss):
+    """A small KPCN learns, with references and without, and its weights load as a denoiser."""
+    changes = {"data": [str(folder)], "crop": 16, "held_out_scenes": ["two"], "loss": loss}
+    changes |= {"steps": 20, "evaluate_every": 20, "peak_rate": 0.01, "inputs": ["variance"]}
+    chosen = config.load(DenoiserConfig, "smoke", changes)
+    outcome = train(DenoiserTask(chosen), tmp_path)
+    loaded = pd.denoisers.load(outcome.weights)
+    assert loaded.inputs == ("variance",)
+    jax.tree.map(np.testing.assert_array_equal, loaded.params, outcome.state.best.params)
+    lines = [json.loads(line) for line in (tmp_path / "curves.jsonl").read_text().splitlines()]
+    last = lines[-2]
+    assert lines[-1]["denoised/rmse/4spp"] < lines[-1]["render/rmse/4spp"]
+    assert np.isfinite(last["train/loss"])
+
+
+def test_denoiser_configurations(folder):
+    assert config.names(DenoiserConfig) == ("cpu", "gpu", "paper", "smoke")
+    for name in config.names(DenoiserConfig):
+        config.load(DenoiserConfig, name)
+    for changes, message in (
+        ({"architecture": "vit"}, "architecture is 'vit', expected one of 'unet', 'kpcn'"),
+        ({"options": {"depth": 2}}, "options is {'depth': 2}: .*depth"),
+        ({"inputs": ["albedo"]}, "has no albedo, which this denoiser takes"),
+    ):
+        values = {"data": [str(folder)], "crop": 16, **changes}
+        with pytest.raises(ValueError, match=message):
+            DenoiserTask(config.load(DenoiserConfig, "smoke", values))
+    with pytest.raises(ValueError, match="inputs is 'depth', expected one of 'albedo'"):
+        config.load(DenoiserConfig, "smoke", {"inputs": ["depth"]})
 
 
 def test_a_batch_that_devices_cannot_share(trainer):

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from progden_jax._convolution import same_convolution
 from progden_jax.denoisers.nodes import (
     Add,
     Affine,
@@ -248,14 +249,8 @@ def evaluate(
 
 
 def _convolve(layer: Any, x: Array, precision: Any) -> Array:
-    value = lax.conv_general_dilated(
-        x[None],
-        layer["kernel"],
-        (1, 1),
-        "SAME",
-        dimension_numbers=("NHWC", "HWIO", "NHWC"),
-        precision=precision,
-    )[0]
+    kernel = jnp.asarray(layer["kernel"])
+    value = same_convolution(x[None], kernel, precision)[0]
     return value + layer["bias"] if "bias" in layer else value
 
 
