@@ -1,6 +1,7 @@
 """Training: configurations, data, cache, augmentation, the loop and its resumption."""
 
 import dataclasses
+import functools
 import json
 import os
 import subprocess
@@ -18,12 +19,22 @@ from jax.sharding import Mesh
 import progden_jax as pd
 from progden_jax import mixers
 from progden_jax.cli import main
-from progden_jax.training import MixerConfig, MixerTask, Trainer, config, losses, order, train
+from progden_jax.training import (
+    DenoiserConfig,
+    DenoiserTask,
+    MixerConfig,
+    MixerTask,
+    Trainer,
+    config,
+    losses,
+    order,
+    train,
+)
 from progden_jax.training import augment as augmenting
 from progden_jax.training.estimates import EstimateCache
 from progden_jax.training.index import index, split
 from progden_jax.training.mixer_task import swapped_alpha
-from progden_jax.training.step import initial_state, make_step
+from progden_jax.training.step import make_start, make_step
 
 SIZE = 24
 
@@ -275,58 +286,105 @@ def test_swap_symmetry(images):
         )
         return swapped, straight
 
-    swapped, straight = both(paper.init(jax.random.key(0)))
+    swapped, straight = both(jax.jit(paper.init)(jax.random.key(0)))
     np.testing.assert_allclose(swapped, 1 - straight, atol=1e-6)
-    alpha = pd.closed_form_alpha(x, y, variance, divergence, window=9)
-    beta = pd.closed_form_alpha(y, x, risk, divergence, window=9)
+    closed = jax.jit(functools.partial(pd.closed_form_alpha, window=9))
+    alpha, beta = closed(x, y, variance, divergence), closed(y, x, risk, divergence)
     inner = (alpha > 0) & (alpha < 1)
     assert inner.mean() > 0.2
     np.testing.assert_allclose((alpha + beta)[inner], 1, atol=1e-4)
 
 
-def test_cache_of_estimates(real_frame, tmp_path):
-    frame = jax.tree.map(lambda a: a[:SIZE, :SIZE] if a.ndim else a, real_frame)
+@pytest.fixture(scope="module")
+def render(folder) -> pd.Frame:
+    """One of the renders, as training sees it."""
+    return pd.read_exr(folder / "one_000004spp.exr").replace(spp=None)
+
+
+def test_cache_of_estimates(render, tmp_path):
     method = pd.MonteCarlo(1)
     cache = EstimateCache(Blur(), method, tmp_path)
-    first = cache.get(frame)
+    first = cache.get(render)
     again = EstimateCache(Blur(), method, tmp_path)
-    np.testing.assert_array_equal(again.get(frame).divergence, first.divergence)
+    np.testing.assert_array_equal(again.get(render).divergence, first.divergence)
     assert (cache.misses, again.hits, again.misses) == (1, 1, 0)
-    f = Blur().bind(frame)
-    np.testing.assert_allclose(first.denoised, f(frame.color), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(first.denoised, Blur()(render), rtol=1e-5, atol=1e-6)
     # Everything that the result depends on is in the key.
     keys = {
-        cache.key(frame, 0),
-        cache.key(frame, 1),
-        cache.key(frame.replace(variance=2 * frame.variance), 0),
-        cache.key(frame.replace(albedo=None), 0),
-        EstimateCache(Blur(0.5), method, tmp_path).key(frame, 0),
-        EstimateCache(Blur(), pd.MonteCarlo(2), tmp_path).key(frame, 0),
-        EstimateCache(Blur(), method, tmp_path, tangents=True).key(frame, 0),
+        cache.key(render, 0),
+        cache.key(render, 1),
+        cache.key(render.replace(variance=2 * render.variance), 0),
+        cache.key(render.replace(albedo=render.color), 0),
+        cache.key(render.replace(normal=render.color), 0),
+        EstimateCache(Blur(0.5), method, tmp_path).key(render, 0),
+        EstimateCache(Blur(), pd.MonteCarlo(2), tmp_path).key(render, 0),
+        EstimateCache(Blur(), method, tmp_path, tangents=True).key(render, 0),
     }
-    assert len(keys) == 7
-    # Damaged entries are made again: cut short, and of one bit changed.
+    assert len(keys) == 8
+    # Damaged entries are made again: cut short, of one bit changed, and empty.
     (path,) = tmp_path.iterdir()
     data = path.read_bytes()
     for damaged in (data[:-100], data[:-1] + bytes([data[-1] ^ 1]), b""):
         path.write_bytes(damaged)
         mended = EstimateCache(Blur(), method, tmp_path)
-        np.testing.assert_array_equal(mended.get(frame).divergence, first.divergence)
+        np.testing.assert_array_equal(mended.get(render).divergence, first.divergence)
         assert mended.misses == 1
         assert path.read_bytes() == data
-    unnamed = EstimateCache(pd.FunctionDenoiser(lambda x: x / 2), method, tmp_path)
-    unnamed.get(frame)
-    assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_tangents_in_the_cache(real_frame, tmp_path):
-    frame = jax.tree.map(lambda a: a[:SIZE, :SIZE] if a.ndim else a, real_frame)
-    found = EstimateCache(Blur(), pd.MonteCarlo(1), tmp_path, tangents=True).get(frame)
-    np.testing.assert_allclose(np.abs(found.probe), np.sqrt(frame.variance), rtol=1e-5)
-    # Blur is linear, so its derivative along the probe is itself.
-    np.testing.assert_allclose(
-        found.tangent, Blur()(frame.replace(color=jnp.asarray(found.probe))), rtol=1e-4, atol=1e-6
+def test_a_python_function_is_not_cached(tmp_path):
+    """Its name in a pytree is its address, which another may have in the next process."""
+    assert EstimateCache(Blur(), pd.MonteCarlo(1), tmp_path).stores
+    unnamed = pd.FunctionDenoiser(lambda x: x / 2)
+    assert not EstimateCache(unnamed, pd.MonteCarlo(1), tmp_path).stores
+
+
+@dataclasses.dataclass(frozen=True)
+class Tilt:
+    """An architecture of one weight."""
+
+    def init(self, key):
+        del key
+        return {"slope": jnp.asarray(0.3)}
+
+    def apply(self, params, x, y, variance, divergence, sure, *, inside=None):
+        return jax.nn.sigmoid(params["slope"] * (sure - variance + x))
+
+
+def test_training_by_sure_alone(folder, render, tmp_path, monkeypatch):
+    """The derivative of α along the cached probe is what finite differences through the denoiser give."""
+    monkeypatch.setitem(mixers.ARCHITECTURES, "tilt", Tilt)
+    changes = {"architecture": "tilt", "options": {}, "draws": 2, "swap": 0.0}
+    changes |= {"loss": "sure", "sure_derivative": "probe", "exposure_stops": 0.0}
+    task = MixerTask(_config(folder, **changes), denoiser=Blur(), cache_folder=tmp_path)
+    assert task.arrays["divergence"].shape == (4, 2, SIZE, SIZE, 3)
+    arrays = {n: a if n == "mean_variance" else a[:1] for n, a in task.arrays.items()}
+    arrays["divergence"] = arrays["divergence"][:, 0]
+    np.testing.assert_allclose(np.abs(arrays["probe"][0]), np.sqrt(render.variance), rtol=1e-5)
+    params = task.init(None)
+
+    @jax.jit
+    def alpha(step):
+        x = render.color + step * arrays["probe"][0]
+        y, variance, divergence = _blurred(1.0, x), render.variance, arrays["divergence"][0]
+        risk = pd.sure(x, y, variance, divergence)
+        return Tilt().apply(params, x, y, variance, divergence, risk)
+
+    along = np.asarray(alpha(0.02) - alpha(-0.02)) / 0.04
+    x, y = render.color, _blurred(1.0, render.color)
+    risk = losses.mix_risk(
+        alpha(0.0),
+        x,
+        y,
+        render.variance,
+        arrays["divergence"][0],
+        along * arrays["probe"][0],
     )
+    expected = (risk / (y**2 + 0.01)).mean()
+    batch = {**arrays, "swap": jnp.zeros(1, bool)}
+    loss, found = jax.jit(jax.value_and_grad(lambda p: task.loss(p, batch)[0]))(params)
+    np.testing.assert_allclose(loss, expected, rtol=1e-3)
+    assert np.isfinite(found["slope"])
 
 
 def test_risk_of_the_mix_is_unbiased():
@@ -346,29 +404,38 @@ def test_risk_of_the_mix_is_unbiased():
 
 
 @pytest.mark.parametrize(
-    "changes",
-    [
-        {"loss": "sure", "sure_derivative": "probe", "draws": 2, "options": {"width": 4}},
-        {"loss": "logl1", "options": {"width": 4, "space": "log", "ratio": False, "sure": False}},
-    ],
+    ("loss", "bound"),
+    [("smape", False), ("smape", True), ("relmse", False), ("l1", False), ("logl1", False)],
 )
-def test_variants_have_finite_gradients(folder, tmp_path, changes):
-    task = MixerTask(_config(folder, **changes), denoiser=Blur(), cache_folder=tmp_path)
-    assert task.arrays["divergence"].shape == (4, changes.get("draws", 1), SIZE, SIZE, 3)
-
-    arrays = jax.tree.map(jnp.asarray, task.arrays)
+def test_losses_and_the_bound(trainer, monkeypatch, loss, bound):
+    """Each loss is the mean over the batch of what its formula says of the mix."""
+    task = trainer.task
+    changes = {"loss": loss, "bound": bound}
+    monkeypatch.setattr(task, "config", dataclasses.replace(task.config, **changes))
+    monkeypatch.setattr(task, "architecture", Tilt())
+    batch = {name: jnp.asarray(a[:2]) for name, a in task.arrays.items()}
+    batch["divergence"], batch["swap"] = batch["divergence"][:, 0], jnp.asarray([False, True])
+    x, y, v, d = (batch[n] for n in ("color", "denoised", "variance", "divergence"))
+    params = Tilt().init(None)
 
     @jax.jit
-    def gradient(key):
-        keys = jax.random.split(key, 2)
-        batch = jax.vmap(task.example, (None, 0, 0))(arrays, jnp.arange(2), keys)
-        params = task.init(key)
-        return jax.value_and_grad(lambda p: task.loss(p, batch)[0])(params)
+    def mixed():
+        risk = pd.sure(x, y, v, d)
+        straight, swapped = (
+            Tilt().apply(params, *a) for a in ((x, y, v, d, risk), (y, x, risk, d, v))
+        )
+        alpha = jnp.stack([straight[0], 1 - swapped[1]])
+        return x + (jax.vmap(pd.t_bound)(alpha, x, y, v) if bound else alpha) * (y - x)
 
-    loss, found = gradient(jax.random.key(2))
-    assert np.isfinite(loss)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
-    assert sum(float(jnp.abs(leaf).sum()) for leaf in jax.tree.leaves(found)) > 0
+    z, truth = (np.asarray(a, np.float64) for a in (mixed(), batch["reference"]))
+    formula = {
+        "smape": abs(z - truth) / (abs(z) + abs(truth) + 0.01),
+        "relmse": (z - truth) ** 2 / (truth**2 + 0.01),
+        "l1": abs(z - truth),
+        "logl1": abs(np.log1p(np.maximum(z, 0)) - np.log1p(np.maximum(truth, 0))),
+    }[loss]
+    found = jax.jit(lambda p: task.loss(p, batch)[0])(params)
+    np.testing.assert_allclose(found, formula.mean(), rtol=1e-4)
 
 
 def test_log_weights():
@@ -569,7 +636,7 @@ def train_on_devices(folder: str) -> None:
         devices = jax.devices()[:count]
         assert len(devices) == count
         step = make_step(Line(), Mesh(np.asarray(devices), ("batch",)) if count > 1 else None)
-        state = initial_state(Line())
+        state = make_start(Line())(jax.random.key(0))
         for _ in range(5):
             state, scalars = step(state, Line.arrays, jax.random.key(1), jnp.asarray([0, 3, 5, 7]))
         states.append((state.params, scalars))
@@ -577,6 +644,38 @@ def train_on_devices(folder: str) -> None:
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), one, two)
     assert one[0]["slope"] > 0
     Path(folder, "done").touch()
+
+
+@pytest.mark.parametrize("loss", ["smape", "sure"])
+def test_training_a_denoiser(folder, tmp_path, loss):
+    """A small KPCN learns, with references and without, and its weights load as a denoiser."""
+    changes = {"data": [str(folder)], "crop": 16, "held_out_scenes": ["two"], "loss": loss}
+    changes |= {"steps": 20, "evaluate_every": 20, "peak_rate": 0.01, "inputs": ["variance"]}
+    chosen = config.load(DenoiserConfig, "smoke", changes)
+    outcome = train(DenoiserTask(chosen), tmp_path)
+    loaded = pd.denoisers.load(outcome.weights)
+    assert loaded.inputs == ("variance",)
+    jax.tree.map(np.testing.assert_array_equal, loaded.params, outcome.state.best.params)
+    lines = [json.loads(line) for line in (tmp_path / "curves.jsonl").read_text().splitlines()]
+    last = lines[-2]
+    assert lines[-1]["denoised/rmse/4spp"] < lines[-1]["render/rmse/4spp"]
+    assert np.isfinite(last["train/loss"])
+
+
+def test_denoiser_configurations(folder):
+    assert config.names(DenoiserConfig) == ("cpu", "gpu", "paper", "smoke")
+    for name in config.names(DenoiserConfig):
+        config.load(DenoiserConfig, name)
+    for changes, message in (
+        ({"architecture": "vit"}, "architecture is 'vit', expected one of 'unet', 'kpcn'"),
+        ({"options": {"depth": 2}}, "options is {'depth': 2}: .*depth"),
+        ({"inputs": ["albedo"]}, "has no albedo, which this denoiser takes"),
+    ):
+        values = {"data": [str(folder)], "crop": 16, **changes}
+        with pytest.raises(ValueError, match=message):
+            DenoiserTask(config.load(DenoiserConfig, "smoke", values))
+    with pytest.raises(ValueError, match="inputs is 'depth', expected one of 'albedo'"):
+        config.load(DenoiserConfig, "smoke", {"inputs": ["depth"]})
 
 
 def test_a_batch_that_devices_cannot_share(trainer):

@@ -19,6 +19,7 @@ HELP = """Train a mixing network or a denoiser on renders with references.
 
 ```
 progden train mixer --config cpu --data renders/ --output runs/hdr
+progden train denoiser --config cpu --set inputs=['albedo','normal'] --data renders/ -o runs/unet
 progden train mixer --config mine.toml --set denoiser=oidn-hdr-alb-nrm -o runs/aux
 tensorboard --logdir runs
 ```
@@ -75,6 +76,30 @@ def mixer(
 
 
 _ = app.command(mixer, help=_MIXER_HELP, usage="Usage: progden train mixer -o OUTPUT [OPTIONS]")
+
+
+def denoiser(
+    *,
+    output: Annotated[Path, _OUTPUT],
+    config: Annotated[str, _CONFIG] = "cpu",
+    data: Annotated[tuple[Path, ...], _DATA] = (),
+    set: Annotated[tuple[str, ...], _SET] = (),
+    until: Annotated[int | None, _UNTIL] = None,
+    json: Annotated[bool, _JSON] = False,
+) -> int:
+    from progden_jax.training import DenoiserConfig, DenoiserTask
+
+    chosen = _load(DenoiserConfig, config, data, set)
+
+    def task(progress: Callable[[int, int], None]) -> "Task":
+        return DenoiserTask(chosen, progress=progress)
+
+    return _train(task, output, until=until, json=json)
+
+
+_ = app.command(
+    denoiser, help=_DENOISER_HELP, usage="Usage: progden train denoiser -o OUTPUT [OPTIONS]"
+)
 
 
 def _load(

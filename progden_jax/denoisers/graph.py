@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from progden_jax._convolution import same_convolution
 from progden_jax._numeric import own_zero
 from progden_jax.denoisers.nodes import (
     Add,
@@ -251,16 +252,18 @@ def evaluate(
 
 
 def _convolve(layer: Any, x: Array, precision: Any) -> Array:
-    kernel, narrow = jnp.asarray(layer["kernel"]), precision == "bfloat16"
-    value = lax.conv_general_dilated(
-        x[None].astype(jnp.bfloat16) if narrow else x[None],
-        kernel.astype(jnp.bfloat16) if narrow else kernel,
-        (1, 1),
-        "SAME",
-        dimension_numbers=("NHWC", "HWIO", "NHWC"),
-        precision=None if narrow else precision,
-        preferred_element_type=x.dtype if narrow else None,
-    )[0]
+    kernel = jnp.asarray(layer["kernel"])
+    if precision == "bfloat16":
+        value = lax.conv_general_dilated(
+            x[None].astype(jnp.bfloat16),
+            kernel.astype(jnp.bfloat16),
+            (1, 1),
+            "SAME",
+            dimension_numbers=("NHWC", "HWIO", "NHWC"),
+            preferred_element_type=x.dtype,
+        )[0]
+    else:
+        value = same_convolution(x[None], kernel, precision)[0]
     return value + layer["bias"] if "bias" in layer else value
 
 

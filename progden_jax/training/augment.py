@@ -76,17 +76,23 @@ def apply(
     change: Change, example: Mapping[str, Float[Array, "..."]], *, crop: int
 ) -> dict[str, Float[Array, "..."]]:
     """The changed buffers: (H, W, C) become (crop, crop, C), scalars stay scalars."""
-    return {name: _apply(change, name, buffer, crop) for name, buffer in example.items()}
+    images = {name: buffer for name, buffer in example.items() if buffer.ndim}
+    # As one array, for each step is compiled, and run, once.
+    stacked = jnp.concatenate(list(images.values()), axis=-1)
+    start, size = (change.row, change.column, 0), (crop, crop, stacked.shape[-1])
+    stacked = jax.lax.dynamic_slice(stacked, start, size)
+    stacked = jnp.where(change.transpose, stacked.swapaxes(0, 1), stacked)
+    stacked = jnp.where(change.flip_rows, stacked[::-1], stacked)
+    stacked = jnp.where(change.flip_columns, stacked[:, ::-1], stacked)
+    ends = np.cumsum([image.shape[-1] for image in images.values()])
+    moved = dict(zip(images, jnp.split(stacked, ends[:-1], axis=-1), strict=True))
+    return {
+        name: _recolored(change, name, moved.get(name, buffer)) for name, buffer in example.items()
+    }
 
 
-def _apply(change: Change, name: str, buffer: Array, crop: int) -> Array:
-    if buffer.ndim:
-        start = (change.row, change.column, 0)
-        buffer = jax.lax.dynamic_slice(buffer, start, (crop, crop, buffer.shape[-1]))
-        buffer = jnp.where(change.transpose, buffer.swapaxes(0, 1), buffer)
-        buffer = jnp.where(change.flip_rows, buffer[::-1], buffer)
-        buffer = jnp.where(change.flip_columns, buffer[:, ::-1], buffer)
-        if name not in _UNCOLORED:
-            buffer = jnp.take(buffer, jnp.asarray(ORDERS)[change.order], axis=-1)
+def _recolored(change: Change, name: str, buffer: Array) -> Array:
+    if name not in _UNCOLORED:
+        buffer = jnp.take(buffer, jnp.asarray(ORDERS)[change.order], axis=-1)
     power = _RADIANCE_POWER.get(name, 0)
     return buffer * jnp.exp2(power * change.stops) if power else buffer

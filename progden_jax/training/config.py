@@ -95,9 +95,16 @@ class MixerConfig(RunConfig):
 class DenoiserConfig(RunConfig):
     """How to train a denoiser."""
 
-    architecture: str = "oidn-unet"  # see progden_jax.training.denoiser_task.ARCHITECTURES
-    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # its settings
+    architecture: str = "unet"  # or kpcn, see progden_jax.denoisers.own.ARCHITECTURES
+    inputs: tuple[str, ...] = ()  # buffers besides the colour, of albedo, normal and variance
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # as size of a unet
     probes: int = 1  # loss sure: of the divergence, drawn anew each step
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _checks.positive_int("probes", self.probes)
+        for role in self.inputs:
+            _checks.choice("inputs", role, ("albedo", "normal", "variance"))
 
 
 Config = TypeVar("Config", bound=RunConfig)

@@ -7,9 +7,9 @@ import jax
 import numpy as np
 
 import progden_jax as pd
-from progden_jax.training.config import Meaning
+from progden_jax.training.config import Meaning, RunConfig
 from progden_jax.training.estimates import EstimateCache
-from progden_jax.training.index import Item
+from progden_jax.training.index import Item, index, split
 
 Progress = Callable[[int, int], None]
 """Called with how many of how many are done."""
@@ -85,6 +85,41 @@ def load(
             rows.setdefault(name, []).append(np.asarray(value, np.float32))
     progress(len(items), len(items))
     return Examples(tuple(items), {name: np.stack(values) for name, values in rows.items()})
+
+
+def load_split(
+    config: RunConfig,
+    *,
+    cache: EstimateCache | None = None,
+    draws: int = 1,
+    auxiliary: Sequence[str] = (),
+    progress: Progress = lambda done, total: None,
+) -> tuple[Examples, Examples]:
+    """(to train on, held out) of the folders that the configuration names; see `load`.
+
+    Raises
+    ------
+    ValueError
+        Also if the crop is larger than the images.
+    """
+    items = index(config.data, spp=config.spp, reference_spp=config.reference_spp)
+    training, held = split(items, share=config.held_out, scenes=config.held_out_scenes)
+    both = load(
+        training + held,
+        variance_of=config.variance_of,
+        cache=cache,
+        draws=draws,
+        auxiliary=auxiliary,
+        progress=progress,
+    )
+    if config.crop > min(both.size):
+        raise ValueError(f"crop is {config.crop}, but the images are {_size(both.size)} pixels.")
+    count = len(training)
+    first, last = (
+        Examples(both.items[part], {name: array[part] for name, array in both.arrays.items()})
+        for part in (slice(count), slice(count, None))
+    )
+    return first, last
 
 
 _repair = jax.jit(lambda frame: pd.repair(frame)[0])

@@ -79,22 +79,29 @@ class HeldOut:
         "balanced" is the mean of the ratios of SMAPE and RMSE, "smape" and "rmse" one of them.
         """
         mixed = np.asarray(_mixed_errors(self._arrays, mixer))
-        errors = {**self._baselines, "mix": mixed}
+        found = {**self._baselines, "mix": mixed}
         floor = np.finfo(np.float32).tiny
         ratios = mixed / np.maximum(self._baselines["denoised"], floor)
         columns = {"rmse": [0], "smape": [1], "balanced": [0, 1]}[score]
-        spp = np.asarray([item.spp for item in self.items])
-        table = {
-            image: {
-                metric: {int(n): float(values[spp == n, column].mean()) for n in np.unique(spp)}
-                for column, metric in enumerate(("rmse", "smape"))
-            }
-            for image, values in errors.items()
+        return Scores(float(ratios[:, columns].mean()), tabulate(self.items, found))
+
+
+def tabulate(
+    items: Sequence[Item], errors: Mapping[str, Float[np.ndarray, "n 2"]]
+) -> dict[str, dict[str, dict[int, float]]]:
+    """Image -> metric -> spp -> mean over scenes, of errors as `errors` gives them."""
+    spp = np.asarray([item.spp for item in items])
+    return {
+        image: {
+            metric: {int(n): float(values[spp == n, column].mean()) for n in np.unique(spp)}
+            for column, metric in enumerate(("rmse", "smape"))
         }
-        return Scores(float(ratios[:, columns].mean()), table)
+        for image, values in errors.items()
+    }
 
 
-def _errors(image: Array, reference: Array) -> Array:
+def errors(image: Float[Array, "h w 3"], reference: Float[Array, "h w 3"]) -> Float[Array, "2"]:
+    """RMSE and SMAPE."""
     return jnp.stack([metrics.rmse(image, reference), metrics.smape(image, reference)])
 
 
@@ -109,14 +116,14 @@ def _baseline_errors(arrays: Mapping[str, Array]) -> dict[str, Array]:
             "closed-form": _mix(example, ClosedForm()),
             "oracle": x + best * (y - x),
         }
-        return {name: _errors(image, reference) for name, image in images.items()}
+        return {name: errors(image, reference) for name, image in images.items()}
 
     return jax.lax.map(one, arrays)
 
 
 @jax.jit
 def _mixed_errors(arrays: Mapping[str, Array], mixer: Mixer) -> Array:
-    return jax.lax.map(lambda e: _errors(_mix(e, mixer), e["reference"]), arrays)
+    return jax.lax.map(lambda e: errors(_mix(e, mixer), e["reference"]), arrays)
 
 
 def _mix(example: Mapping[str, Array], mixer: Mixer) -> Array:

@@ -18,7 +18,7 @@ from progden_jax.training import order
 from progden_jax.training.checkpoints import Checkpoints, claim, describe, plain
 from progden_jax.training.curves import Curves
 from progden_jax.training.evaluation import Scores
-from progden_jax.training.step import State, Task, initial_state, keep_best, make_step, schedule
+from progden_jax.training.step import State, Task, keep_best, make_start, make_step, schedule
 
 WEIGHTS = "weights.safetensors"
 """The best weights so far, in the run's folder."""
@@ -73,6 +73,7 @@ class Trainer:
         self._everywhere = NamedSharding(mesh, PartitionSpec())
         self._arrays = jax.device_put(dict(task.arrays), self._everywhere)
         self._key = jax.device_put(jax.random.key(task.config.seed), self._everywhere)
+        self._start = make_start(task)
         self._step = make_step(task, mesh if len(devices) > 1 else None)
         self._rate = schedule(task.config)
         self._metadata = {
@@ -92,7 +93,7 @@ class Trainer:
         task, config, folder = self.task, self.task.config, Path(folder)
         claim(folder, describe(task.kind, config, task.items))
         with Checkpoints(folder) as checkpoints:
-            state = jax.device_put(initial_state(task), self._everywhere)
+            state = jax.device_put(self._start(self._key), self._everywhere)
             state = checkpoints.restore(state) or state
             with Curves(folder, int(state.step)) as curves:
                 outlets = _Outlets(folder, curves, checkpoints, report)

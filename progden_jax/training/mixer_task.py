@@ -17,7 +17,6 @@ from progden_jax.sure import sure
 from progden_jax.training import augment, data, evaluation, losses
 from progden_jax.training.config import MixerConfig
 from progden_jax.training.estimates import EstimateCache
-from progden_jax.training.index import index, split
 from progden_jax.tstatistic import t_bound
 
 METHODS = {
@@ -68,25 +67,12 @@ class MixerTask:
         tangents = config.loss == "sure" and config.sure_derivative == "probe"
         method = build_method(config)
         self.cache = EstimateCache(denoiser, method, cache_folder, tangents=tangents)
-        items = index(config.data, spp=config.spp, reference_spp=config.reference_spp)
-        training, held = split(items, share=config.held_out, scenes=config.held_out_scenes)
-        examples = data.load(
-            training + held,
-            variance_of=config.variance_of,
-            cache=self.cache,
-            draws=config.draws,
-            progress=progress,
+        examples, held = data.load_split(
+            config, cache=self.cache, draws=config.draws, progress=progress
         )
-        if config.crop > min(examples.size):
-            raise ValueError(
-                f"crop is {config.crop}, but the images are {examples.size[1]}×{examples.size[0]} pixels."
-            )
-        count = len(training)
         self.size = examples.size
-        self.items = examples.items[:count]
-        self.arrays = {name: array[:count] for name, array in examples.arrays.items()}
-        held_arrays = {name: array[count:] for name, array in examples.arrays.items()}
-        self.held_out = evaluation.HeldOut(examples.items[count:], held_arrays)
+        self.items, self.arrays = examples
+        self.held_out = evaluation.HeldOut(*held)
 
     def init(self, key: jax.Array) -> Params:
         return self.architecture.init(key)

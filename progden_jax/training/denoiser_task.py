@@ -1,0 +1,113 @@
+"""What it is to train a denoiser: its examples, loss and evaluation."""
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from progden_jax import _checks
+from progden_jax.denoisers import files, own
+from progden_jax.divergence import MonteCarlo
+from progden_jax.frame import Frame
+from progden_jax.sure import sure
+from progden_jax.training import augment, data, evaluation, losses
+from progden_jax.training.config import DenoiserConfig
+
+_BUFFERS = ("albedo", "normal")
+
+
+class DenoiserTask:
+    """A denoiser from scratch; its weights are the denoiser itself, as a pytree. See `step.Task`.
+
+    The loss is of y = f(x) against the reference, or, with the loss "sure", Stein's estimate of y's error
+    over y² + 0.01, which needs no reference: only renders with their variances. The divergence is then
+    estimated anew in each step with random probes, and differentiated through.
+
+    Parameters
+    ----------
+    config : what to train on and how; `config.data` names the folders.
+    progress : called with how many of how many renders are loaded.
+
+    Raises
+    ------
+    ValueError
+        If the data or the configuration will not do.
+    """
+
+    kind = "denoiser"
+
+    def __init__(
+        self,
+        config: DenoiserConfig,
+        *,
+        progress: data.Progress = lambda done, total: None,
+    ) -> None:
+        _checks.choice("architecture", config.architecture, own.ARCHITECTURES)
+        self.config = config
+        try:
+            jax.eval_shape(self.init, jax.random.key(0))
+        except TypeError as error:
+            raise ValueError(f"options is {dict(config.options)}: {error}") from None
+        auxiliary = [role for role in _BUFFERS if role in config.inputs]
+        examples, held = data.load_split(config, auxiliary=auxiliary, progress=progress)
+        self.size = examples.size
+        self.items, self.arrays = examples
+        self._held_items = held.items
+        self._held = {name: jnp.asarray(array) for name, array in held.arrays.items()}
+
+    def init(self, key: jax.Array) -> Any:
+        kind: Any = own.ARCHITECTURES[self.config.architecture]
+        return kind.init(key, self.config.inputs, precision="default", **self.config.options)
+
+    def example(
+        self, arrays: Mapping[str, Array], index: Array, key: jax.Array
+    ) -> dict[str, Array]:
+        """One augmented example, and a key for its probes."""
+        change_key, probe_key = jax.random.split(key)
+        change = augment.draw(change_key, self.size, self.config)
+        picked = {name: array[index] for name, array in arrays.items()}
+        changed = augment.apply(change, picked, crop=self.config.crop)
+        return {**changed, "key": probe_key}
+
+    def loss(
+        self, params: Any, batch: Mapping[str, Float[Array, "b ..."]]
+    ) -> tuple[Array, dict[str, Array]]:
+        """The loss over a batch of examples."""
+        return jax.vmap(self._one, (None, 0))(params, dict(batch)).mean(), {}
+
+    def _one(self, denoiser: Any, example: Mapping[str, Array]) -> Array:
+        f, x = denoiser.bind(_frame(example)), example["color"]
+        if self.config.loss != "sure":
+            return losses.SUPERVISED[self.config.loss](f(x), example["reference"]).mean()
+        method, variance = MonteCarlo(self.config.probes), example["variance"]
+        y, divergence, *_ = method.evaluate(f, x, variance, example["key"])
+        return losses.relative_risk(sure(x, y, variance, divergence), y).mean()
+
+    def evaluate(self, params: Any) -> evaluation.Scores:
+        """RMSE and SMAPE on the held-out scenes; the score is the mean SMAPE."""
+        found = {name: np.asarray(v) for name, v in _held_errors(self._held, params).items()}
+        table = evaluation.tabulate(self._held_items, found)
+        return evaluation.Scores(float(found["denoised"][:, 1].mean()), table)
+
+    def export(self, path: os.PathLike[str], params: Any, metadata: Mapping[str, str]) -> None:
+        """Write weights that `denoisers.load` takes."""
+        files.save(path, params, dtype="float32", metadata=metadata)
+
+
+def _frame(example: Mapping[str, Array]) -> Frame:
+    buffers = {role: example.get(role) for role in _BUFFERS}
+    return Frame(example["color"], example["variance"], **buffers)
+
+
+@jax.jit
+def _held_errors(arrays: Mapping[str, Array], denoiser: Any) -> dict[str, Array]:
+    def one(example: Mapping[str, Array]) -> dict[str, Array]:
+        x, reference = example["color"], example["reference"]
+        y = denoiser.bind(_frame(example))(x)
+        return {n: evaluation.errors(i, reference) for n, i in (("render", x), ("denoised", y))}
+
+    return jax.lax.map(one, dict(arrays))

@@ -1,0 +1,175 @@
+"""Learned mixers: architectures, weights files, padding; and the convolution that they train with."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+import progden_jax as pd
+from progden_jax import mixers, pipeline
+from progden_jax._convolution import same_convolution
+from progden_jax.cli import main
+from progden_jax.mixing import f_act
+
+
+@pytest.fixture(scope="module")
+def mixer() -> pd.NetworkMixer:
+    """A network of 4 channels with biases in which a border would show."""
+    architecture = mixers.build("paper", {"width": 4})
+    params = jax.jit(architecture.init)(jax.random.key(1))
+    params = jax.tree.map(lambda p: np.asarray(p) + 0.05, params)
+    return pd.NetworkMixer(params, architecture, metadata={"denoiser": "blur"})
+
+
+def test_weights_round_trip(mixer, tmp_path, images):
+    path = tmp_path / "mine.safetensors"
+    mixers.save_mixer(path, mixer, steps="3")
+    loaded = pd.load_mixer(path)
+    assert loaded.architecture == mixer.architecture
+    assert loaded.metadata["denoiser"] == "blur"
+    assert loaded.metadata["steps"] == "3"
+    jax.tree.map(np.testing.assert_array_equal, loaded.params, mixer.params)
+    mixers.save_mixer(path, mixer, dtype="float16")
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-6),
+        pd.load_mixer(path).params,
+        mixer.params,
+    )
+
+
+def test_weights_that_will_not_do(mixer, tmp_path, capsys):
+    path = tmp_path / "mine.safetensors"
+    with pytest.raises(ValueError, match="expected one of closed-form"):
+        pd.load_mixer("guess")
+    with pytest.raises(ValueError, match="cannot read the weights"):
+        pd.load_mixer(path)
+    for text in ({"kind": "denoiser"}, {"kind": "mixer"}):
+        mixers._safetensors.write(path, mixer.params, text, dtype="float32")
+        with pytest.raises(ValueError, match="holds no mixer|'architecture'"):
+            pd.load_mixer(path)
+    wider = pd.NetworkMixer(mixer.params, mixers.build("paper", {"width": 5}))
+    mixers.save_mixer(path, wider)
+    with pytest.raises(ValueError, match="not those of the architecture Paper\\(width=5"):
+        pd.load_mixer(path)
+    with pytest.raises(ValueError, match="has no setting 'depth', expected some of width, sure"):
+        mixers.build("paper", {"depth": 3})
+    with pytest.raises(ValueError, match="architecture is 'huge', expected one of 'paper'"):
+        mixers.build("huge")
+    with pytest.raises(ValueError, match="space is 'cubic'"):
+        mixers.build("paper", {"space": "cubic"})
+    render = str(tmp_path / "a.exr")
+    pd.write_exr(render, np.ones((4, 4, 3), np.float32))
+    assert main(["denoise", render, "-o", str(tmp_path / "b.exr"), "--mixer", "guess"]) == 2
+    assert "--mixer: mixer is 'guess', expected one of closed-form" in capsys.readouterr().err
+
+
+def test_default_mixers(mixer, tmp_path, monkeypatch):
+    """A file in the package's folder is the default for the denoiser that it is named after."""
+    monkeypatch.setattr(mixers, "_FOLDER", tmp_path)
+    mixers._shipped.cache_clear()
+    blur = pd.FunctionDenoiser(lambda x: x / 2)
+    assert mixers.names() == ("closed-form",)
+    assert mixers.default_for(blur) == pd.ClosedForm() == pd.load_mixer("closed-form")
+    mixers.save_mixer(tmp_path / "mixer-oidn-hdr.safetensors", mixer)
+    assert mixers.names() == ("closed-form", "oidn-hdr")
+    named = pd.denoisers.load("oidn-hdr")
+    assert mixers.default_for(named).architecture == mixer.architecture
+    assert mixers.default_for(named) is pd.load_mixer("oidn-hdr")
+    assert mixers.default_for(blur) == pd.ClosedForm()
+    mixers._shipped.cache_clear()
+
+
+def test_padding_is_as_the_border_of_the_image(mixer, images):
+    """With `inside`, α is what it is for the image alone, whatever stands in the padding."""
+    known = [images.x, images.y, images.variance, images.divergence, images.divergence]
+    rng = np.random.default_rng(0)
+    padded = []
+    for image in known:
+        big = rng.normal(size=(16, 24, 3)).astype(np.float32)
+        big[:13, :18] = image
+        padded.append(big)
+    inside = np.zeros((16, 24, 1), bool)
+    inside[:13, :18] = True
+    run = jax.jit(lambda arrays, inside: mixer(*arrays, inside=inside))
+    alone, found = run(known, None), run(padded, inside)[:13, :18]
+    assert float(jnp.mean((alone > 0) & (alone < 1))) > 0.05
+    np.testing.assert_allclose(found, alone, rtol=1e-4, atol=1e-5)
+
+
+def test_in_the_pipeline(mixer, images):
+    """Through jit, as an argument; one program for all weights, equal to the parts put together."""
+    denoiser = pd.FunctionDenoiser(lambda x: 0.5 * x + 0.1)
+    frame = pd.Frame(images.x, images.variance)
+    result = pd.progressive_denoise(frame, denoiser, mixer=mixer)
+    size = pipeline._progressive._cache_size()
+    other = pd.NetworkMixer(jax.tree.map(lambda p: 2 * p, mixer.params), mixer.architecture)
+    changed = pd.progressive_denoise(frame, denoiser, mixer=other)
+    assert pipeline._progressive._cache_size() == size
+    assert not np.allclose(changed.alpha, result.alpha)
+    y, divergence, risk = result.denoised, result.divergence, result.sure
+    alpha = jax.jit(
+        lambda m: pd.t_bound(
+            m(images.x, y, images.variance, divergence, risk), images.x, y, images.variance
+        )
+    )(mixer)
+    np.testing.assert_allclose(result.alpha, alpha, rtol=1e-4, atol=1e-5)
+
+
+def test_activation_has_a_gradient_at_the_start(images):
+    """f_act of a fresh network is neither 0 nor 1 anywhere, so every pixel teaches it; nothing is NaN."""
+    architecture = mixers.build("paper", {"width": 4})
+
+    @jax.jit
+    def start(key):
+        params = architecture.init(key)
+        risk = pd.sure(images.x, images.y, images.variance, images.divergence)
+
+        def total(params):
+            alpha = architecture.apply(
+                params, images.x, images.y, images.variance, images.divergence, risk
+            )
+            return alpha.sum(), alpha
+
+        return jax.grad(total, has_aux=True)(params)
+
+    found, alpha = start(jax.random.key(0))
+    assert ((alpha > 0) & (alpha < 1)).mean() > 0.9
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
+    # At the singularity itself the slope is that of the floor, 1e-6.
+    slope = jax.grad(lambda a: f_act(a, jnp.zeros(()), jnp.zeros(())))(jnp.asarray(5e-7))
+    np.testing.assert_allclose(slope, 1e6, rtol=1e-5)
+
+
+@pytest.mark.parametrize("channels", [3, 40])
+def test_convolution_and_its_derivatives(channels):
+    """Forward and reverse mode, second derivatives and batches, against XLA's own."""
+    rng = np.random.default_rng(0)
+    x = jnp.asarray(rng.normal(size=(2, 2, 6, 7, channels)), jnp.float32)
+    kernel = jnp.asarray(rng.normal(size=(3, 5, channels, 2)) / channels, jnp.float32)
+
+    def plain(x, kernel):
+        numbers = ("NHWC", "HWIO", "NHWC")
+        return lax.conv_general_dilated(x, kernel, (1, 1), "SAME", dimension_numbers=numbers)
+
+    def derivatives(convolution):
+        def total(x, kernel):
+            return (jnp.sin(jax.vmap(convolution, (0, None))(x, kernel)) ** 2).sum()
+
+        def along(x, kernel):
+            return jax.jvp(total, (x, kernel), (x, kernel))[1]
+
+        return jax.jit(
+            lambda: (
+                jax.grad(total, (0, 1))(x, kernel),
+                along(x, kernel),
+                jax.grad(along, (0, 1))(x, kernel),
+                jax.vmap(jax.grad(lambda x, k: convolution(x, k).sum(), 1), (0, None))(x, kernel),
+            )
+        )()
+
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4),
+        derivatives(same_convolution),
+        derivatives(plain),
+    )
