@@ -1,0 +1,153 @@
+"""Monte Carlo or exact? Every estimator of the divergence against the exact one, and what its error does.
+
+    python -m experiments.divergence.methods
+
+Per frame and method: the RMSE over pixels of σ²·∂f/∂x relative to the exact one's RMS, the error of the
+image's mean, time and denoiser passes; then how far the SURE map, the closed-form α and the final image are
+from those of the exact divergence, beside how far the latter are from the truth. Goes on with the frames that its CSV lacks.
+"""
+
+import argparse
+import csv
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import progden_jax as pd
+from experiments import _common
+from experiments.divergence import _figures
+from progden_jax import _windows
+from progden_jax.divergence import evaluate
+from progden_jax.training.evaluation import oracle_alpha
+
+HERE = Path(__file__).parent
+WINDOW = 15
+"""Of the closed form, in pixels; SURE maps are compared after averaging over it, too."""
+
+HEADER = (
+    *("denoiser", "scene", "spp", "method", "probes", "passes", "seconds"),
+    *("error", "mean_error", "sure", "sure_exact", "sure_window", "sure_window_exact"),
+    *("alpha", "alpha_exact", "rmse_ratio", "smape_ratio", "image"),
+)
+
+
+def methods(most: int) -> list[tuple[str, int, pd.Method]]:
+    """(name, probes, method) of all that are compared, the exact one first."""
+    found: list[tuple[str, int, pd.Method]] = [("exact", 0, pd.Exact("cone"))]
+    for count in (1, 2, 4, 16, 64, 256):
+        if count <= most:
+            found.append(("differences", count, pd.FiniteDifference(probes=count)))
+            found.append(("rademacher", count, pd.MonteCarlo(probes=count)))
+            found.append(("probing", count, pd.Probing(probes=count)))
+    return found
+
+
+def passes(name: str, count: int, f: Any, x: jax.Array) -> float:
+    """Denoiser passes: the forward one, and one per probe; of the cone what its plan counts."""
+    return 1 + (pd.Exact().cost(f, x)["cone"] if name == "exact" else count)
+
+
+@jax.jit
+def consequences(frame: pd.Frame, reference: jax.Array, y: jax.Array, divergence: jax.Array) -> Any:
+    """The SURE map, the same averaged, the closed form's α and the bounded mix."""
+    x, variance = frame.color, frame.variance
+    assert variance is not None
+    risk = pd.sure(x, y, variance, divergence)
+    alpha = pd.ClosedForm(window=WINDOW)(x, y, variance, divergence, risk)
+    image = x + pd.t_bound(alpha, x, y, variance) * (y - x)
+    ones = _windows.box_sum(jnp.ones_like(x[..., :1]), WINDOW)
+    return {
+        "sure": risk,
+        "sure_window": _windows.box_sum(risk, WINDOW) / ones,
+        "alpha": alpha,
+        "image": image,
+        "truth": (y - reference) ** 2,
+        "truth_window": _windows.box_sum((y - reference) ** 2, WINDOW) / ones,
+        "oracle": oracle_alpha(x, y, reference, window=WINDOW),
+        "rmse": pd.metrics.rmse(image, reference),
+        "smape": pd.metrics.smape(image, reference),
+    }
+
+
+def rms(value: Any) -> float:
+    return float(np.sqrt(np.square(np.asarray(value, np.float64)).mean()))
+
+
+def measure(
+    frame: pd.Frame, reference: jax.Array, denoiser: pd.Denoiser, most: int, key: jax.Array
+) -> list[tuple]:
+    """The columns from "method" on, for every method."""
+    frame, _ = pd.repair(frame)
+    f, x, variance = denoiser.bind(frame), frame.color, frame.variance
+    assert variance is not None
+    truth, right, rows = np.zeros(()), {}, []
+    for name, count, method in methods(most):
+        evaluate(f, x, variance, method=method, key=key) if name != "exact" else None
+        start = time.perf_counter()
+        found = jax.block_until_ready(evaluate(f, x, variance, method=method, key=key))
+        seconds = time.perf_counter() - start
+        estimate = np.asarray(found.divergence, np.float64)
+        seen = consequences(frame, reference, found.value, found.divergence)
+        if name == "exact":
+            truth, right = estimate, seen
+        rows.append(
+            (
+                *(name, count, passes(name, count, f, x), seconds),
+                rms(estimate - truth) / rms(truth),
+                abs(estimate.mean() - truth.mean()) / abs(truth.mean()),
+                rms(seen["sure"] - right["sure"]),
+                rms(right["sure"] - right["truth"]),
+                rms(seen["sure_window"] - right["sure_window"]),
+                rms(right["sure_window"] - right["truth_window"]),
+                rms(seen["alpha"] - right["alpha"]),
+                rms(right["alpha"] - right["oracle"]),
+                float(seen["rmse"] / right["rmse"]),
+                float(seen["smape"] / right["smape"]),
+                rms(seen["image"] - right["image"]) / float(right["rmse"]),
+            )
+        )
+    return rows
+
+
+def main() -> None:
+    parser = _common.parser(__doc__)
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.add_argument("--spp", type=int, nargs="*", default=(8, 128))
+    parser.add_argument("--denoisers", nargs="*", default=("oidn-hdr", "oidn-hdr-alb-nrm"))
+    parser.add_argument("--most", type=int, default=256, help="most probes of a method compared")
+    parser.add_argument("--crop", type=int, default=128, help="side of the frames' corner taken")
+    parser.add_argument("--output", type=Path, default=HERE / "methods.csv")
+    arguments = parser.parse_args()
+    pd.enable_compilation_cache()
+    names = _common.scenes(arguments.data, arguments.scenes)
+    rows: list[dict[str, str]] = []
+    if arguments.output.exists():
+        with arguments.output.open() as file:
+            rows = list(csv.DictReader(file))
+    done = {(r["denoiser"], r["scene"], int(r["spp"])) for r in rows}
+    for which in arguments.denoisers:
+        denoiser = pd.denoisers.load(which)
+        for scene, spp, frame, reference in _common.series(arguments.data, names, arguments.spp):
+            if (which, scene, spp) in done:
+                continue
+            n = arguments.crop
+            frame, truth = jax.tree.map(
+                lambda a, n=n: a[:n, :n] if a.ndim else a, (frame, reference.color)
+            )
+            for row in measure(frame, truth, denoiser, arguments.most, jax.random.key(1)):
+                cells = (which, scene, spp, *row)
+                rows.append(dict(zip(HEADER, map(str, cells), strict=True)))
+            _figures.save(arguments.output, HEADER, rows)
+            print(which, scene, spp, flush=True)
+    table = f"{_common.machine()}\n\n{_figures.table(rows)}\n"
+    arguments.output.with_suffix(".md").write_text(table)
+    _figures.pareto(rows, arguments.output.with_suffix(".png"))
+    print(table)
+
+
+if __name__ == "__main__":
+    main()
