@@ -496,6 +496,8 @@ def _copy(folder: Path, to: Path) -> Path:
 
 
 def test_data_that_will_not_do(folder, tmp_path):
+    with pytest.raises(ValueError, match="kept for reports, which must not be trained on"):
+        MixerTask(_config(tmp_path / "valid"), denoiser=Blur())
     with pytest.raises(ValueError, match="crop is 64, but the images are 24×24"):
         MixerTask(_config(folder, crop=64), denoiser=Blur(), cache_folder=tmp_path)
     with pytest.raises(ValueError, match="oidn-hdr does not follow exposure"):
@@ -646,10 +648,9 @@ def train_on_devices(folder: str) -> None:
     Path(folder, "done").touch()
 
 
-@pytest.mark.parametrize("loss", ["smape", "sure"])
-def test_training_a_denoiser(folder, tmp_path, loss):
-    """A small KPCN learns, with references and without, and its weights load as a denoiser."""
-    changes = {"data": [str(folder)], "crop": 16, "held_out_scenes": ["two"], "loss": loss}
+def test_training_a_denoiser(folder, tmp_path):
+    """A small KPCN learns from renders without references, and its weights load as a denoiser."""
+    changes = {"data": [str(folder)], "crop": 16, "held_out_scenes": ["two"], "loss": "sure"}
     changes |= {"steps": 20, "evaluate_every": 20, "peak_rate": 0.01, "inputs": ["variance"]}
     chosen = config.load(DenoiserConfig, "smoke", changes)
     outcome = train(DenoiserTask(chosen), tmp_path)

@@ -1,6 +1,7 @@
 """Renders, references and estimates as arrays in memory, one per buffer with the examples stacked."""
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -100,8 +101,14 @@ def load_split(
     Raises
     ------
     ValueError
-        Also if the crop is larger than the images.
+        Also if the crop is larger than the images, or a folder is named "valid".
     """
+    for folder in config.data:
+        if Path(folder).resolve().name == "valid":
+            raise ValueError(
+                f"{folder} is named as data kept for reports, which must not be trained on: take another "
+                "folder, or rename it if it is not."
+            )
     items = index(config.data, spp=config.spp, reference_spp=config.reference_spp)
     training, held = split(items, share=config.held_out, scenes=config.held_out_scenes)
     both = load(
