@@ -22,6 +22,18 @@ def mixer() -> pd.NetworkMixer:
     return pd.NetworkMixer(params, architecture, metadata={"denoiser": "blur"})
 
 
+@pytest.fixture(scope="module", params=["paper", "multiscale"])
+def either(request, mixer) -> pd.NetworkMixer:
+    """Of every architecture one, with weights that leave no layer out."""
+    if request.param == "paper":
+        return mixer
+    architecture = mixers.build("multiscale", {"width": 4, "blocks": 1})
+    params = jax.jit(architecture.init)(jax.random.key(1))
+    rng = np.random.default_rng(1)
+    params = jax.tree.map(lambda p: np.float32(p + 0.2 * rng.normal(size=p.shape)), params)
+    return pd.NetworkMixer(params, architecture)
+
+
 def test_weights_round_trip(mixer, tmp_path, images):
     path = tmp_path / "mine.safetensors"
     mixers.save_mixer(path, mixer, steps="3")
@@ -80,7 +92,7 @@ def test_default_mixers(mixer, tmp_path, monkeypatch):
     mixers._shipped.cache_clear()
 
 
-def test_padding_is_as_the_border_of_the_image(mixer, images):
+def test_padding_is_as_the_border_of_the_image(either, images):
     """With `inside`, α is what it is for the image alone, whatever stands in the padding."""
     known = [images.x, images.y, images.variance, images.divergence, images.divergence]
     rng = np.random.default_rng(0)
@@ -91,19 +103,19 @@ def test_padding_is_as_the_border_of_the_image(mixer, images):
         padded.append(big)
     inside = np.zeros((16, 24, 1), bool)
     inside[:13, :18] = True
-    run = jax.jit(lambda arrays, inside: mixer(*arrays, inside=inside))
+    run = jax.jit(lambda arrays, inside: either(*arrays, inside=inside))
     alone, found = run(known, None), run(padded, inside)[:13, :18]
     assert float(jnp.mean((alone > 0) & (alone < 1))) > 0.05
     np.testing.assert_allclose(found, alone, rtol=1e-4, atol=1e-5)
 
 
-def test_in_the_pipeline(mixer, images):
+def test_in_the_pipeline(either, images):
     """Through jit, as an argument; one program for all weights, equal to the parts put together."""
     denoiser = pd.FunctionDenoiser(lambda x: 0.5 * x + 0.1)
     frame = pd.Frame(images.x, images.variance)
-    result = pd.progressive_denoise(frame, denoiser, mixer=mixer)
+    result = pd.progressive_denoise(frame, denoiser, mixer=either)
     size = pipeline._progressive._cache_size()
-    other = pd.NetworkMixer(jax.tree.map(lambda p: 2 * p, mixer.params), mixer.architecture)
+    other = pd.NetworkMixer(jax.tree.map(lambda p: 2 * p, either.params), either.architecture)
     changed = pd.progressive_denoise(frame, denoiser, mixer=other)
     assert pipeline._progressive._cache_size() == size
     assert not np.allclose(changed.alpha, result.alpha)
@@ -112,7 +124,7 @@ def test_in_the_pipeline(mixer, images):
         lambda m: pd.t_bound(
             m(images.x, y, images.variance, divergence, risk), images.x, y, images.variance
         )
-    )(mixer)
+    )(either)
     np.testing.assert_allclose(result.alpha, alpha, rtol=1e-4, atol=1e-5)
 
 
@@ -139,6 +151,42 @@ def test_activation_has_a_gradient_at_the_start(images):
     # At the singularity itself the slope is that of the floor, 1e-6.
     slope = jax.grad(lambda a: f_act(a, jnp.zeros(()), jnp.zeros(())))(jnp.asarray(5e-7))
     np.testing.assert_allclose(slope, 1e6, rtol=1e-5)
+
+
+def test_multiscale_starts_as_the_closed_form(images):
+    """And follows neither exposure nor the order of colours; its gradients are finite where nothing is."""
+    architecture = mixers.build("multiscale", {"width": 3, "blocks": 1})
+    known = (images.x, images.y, images.variance, images.divergence)
+
+    @jax.jit
+    def run(params, x, y, variance, divergence):
+        def total(params, *known):
+            alpha = architecture.apply(params, *known, divergence)
+            return alpha.sum(), alpha
+
+        return jax.grad(total, (0, 1, 2, 3), has_aux=True)(params, x, y, variance, divergence)
+
+    params = jax.jit(architecture.init)(jax.random.key(0))
+    _, alpha = run(params, *known)
+    closed = np.clip(pd.closed_form_alpha(*known, window=15), 0.01, 0.99)
+    np.testing.assert_allclose(alpha, closed, rtol=1e-3)
+    batch = jax.jit(architecture.apply)(params, *(np.stack([k, 2 * k]) for k in known), 0.0)
+    np.testing.assert_allclose(batch[0], alpha, rtol=1e-5)
+
+    rng = np.random.default_rng(2)
+    params = jax.tree.map(lambda p: np.float32(p + 0.3 * rng.normal(size=p.shape)), params)
+    _, alpha = run(params, *known)
+    assert np.abs(alpha - closed).max() > 0.1
+    for scale in (1e-3, 1e4):
+        x, y, variance, divergence = known
+        scaled = (scale * x, scale * y, scale**2 * variance, scale**2 * divergence)
+        _, found = run(params, *(np.float32(k) for k in scaled))
+        np.testing.assert_allclose(found, alpha, rtol=1e-3, atol=1e-4)
+    for nothing in (np.zeros_like(images.x), np.full_like(images.x, 1e6)):
+        zero = np.zeros_like(nothing)
+        gradients, alpha = run(params, nothing, nothing, zero, zero)
+        assert all(np.isfinite(g).all() for g in jax.tree.leaves(gradients))
+        np.testing.assert_array_equal(alpha, 0)
 
 
 @pytest.mark.parametrize("channels", [3, 40])

@@ -403,9 +403,29 @@ def test_risk_of_the_mix_is_unbiased():
             assert (abs(off.mean()) < 4 * standard_error) == unbiased
 
 
+def log_errors(z, truth, x, y):
+    """Of each image log SMAPE + log RMSE, with shares of the better of render and denoised."""
+    relative, squared = (
+        [f(image).mean((1, 2, 3)) for image in (z, x, y)]
+        for f in (
+            lambda i: abs(i - truth) / (abs(i) + abs(truth) + 0.01),
+            lambda i: (i - truth) ** 2,
+        )
+    )
+    relative = relative[0] + 0.05 * np.minimum(*relative[1:])
+    return np.log(relative) + 0.5 * np.log(squared[0] + 0.02 * np.minimum(*squared[1:]))
+
+
 @pytest.mark.parametrize(
     ("loss", "bound"),
-    [("smape", False), ("smape", True), ("relmse", False), ("l1", False), ("logl1", False)],
+    [
+        ("smape", False),
+        ("smape", True),
+        ("relmse", False),
+        ("l1", False),
+        ("logl1", False),
+        ("log-errors", False),
+    ],
 )
 def test_losses_and_the_bound(trainer, monkeypatch, loss, bound):
     """Each loss is the mean over the batch of what its formula says of the mix."""
@@ -433,6 +453,7 @@ def test_losses_and_the_bound(trainer, monkeypatch, loss, bound):
         "relmse": (z - truth) ** 2 / (truth**2 + 0.01),
         "l1": abs(z - truth),
         "logl1": abs(np.log1p(np.maximum(z, 0)) - np.log1p(np.maximum(truth, 0))),
+        "log-errors": log_errors(z, truth, np.asarray(x), np.asarray(y)),
     }[loss]
     found = jax.jit(lambda p: task.loss(p, batch)[0])(params)
     np.testing.assert_allclose(found, formula.mean(), rtol=1e-4)

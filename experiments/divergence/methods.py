@@ -4,7 +4,8 @@
 
 Per frame and method: the RMSE over pixels of σ²·∂f/∂x relative to the exact one's RMS, the error of the
 image's mean, time and denoiser passes; then how far the SURE map, the closed-form α and the final image are
-from those of the exact divergence, beside how far the latter are from the truth. Goes on with the frames that its CSV lacks.
+from those of the exact divergence, beside how far the latter are from the truth. Goes on with the frames that
+its CSV lacks.
 """
 
 import argparse

@@ -5,6 +5,7 @@ import dataclasses
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from progden_jax import _checks, _windows
@@ -116,16 +117,23 @@ def features(
 
     Parameters
     ----------
-    x, y, variance, divergence : (H, W, 3), see `progden_jax.sure`; zero where `inside` is False.
+    x, y, variance, divergence : (H, W, 3), see `progden_jax.sure`.
+    inside : (H, W, 1) False where they are padding around the image.
     """
     counted = jnp.ones_like(x[..., :1]) if inside is None else inside.astype(x.dtype)
 
     def mean(value: Array, window: int) -> Array:
-        pixels = _windows.box_sum(counted, window)
-        return _windows.box_sum(value, window) / jnp.maximum(pixels, 1)
+        value = value if inside is None else jnp.where(inside, value, 0)
+        return _windows.box_sum(value, window) / jnp.maximum(_windows.box_sum(counted, window), 1)
+
+    # In units of the image's mean no square here leaves float32's range, nor its derivatives.
+    luminance = lax.stop_gradient(jnp.maximum(y, 0)) * counted
+    level = luminance.sum() / (3 * counted.sum())
+    unit = jnp.where(level > 0, 1 / jnp.where(level > 0, level, 1), 1)
+    x, y, variance, divergence = unit * x, unit * y, unit**2 * variance, unit**2 * divergence
 
     brightness = mean(jnp.maximum(y, 0).mean(-1, keepdims=True), 15)
-    brightness = brightness + 0.01 * mean(brightness, 31) + 1e-9
+    brightness = brightness + 0.01 * mean(brightness, 31) + 1e-6
     # Below a thousandth of the brightness differences do not show; this keeps ratios of nothing quiet.
     least = 1e-6 * brightness**2
     squared, useful = (y - x) ** 2, variance - divergence
