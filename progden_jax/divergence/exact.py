@@ -31,8 +31,9 @@ class Exact:
         "basis": one tangent per pixel and channel, 3HW in all; any f.
         "coloring": pixels further apart than f reaches share a tangent: 3(R + 1)² of them, more where
             pooling aligns f to blocks; any f whose `reach` is given or known.
-        "cone": through windows of a few pixels in a network whose layers f shows (`f.layered`, as OIDN's
-            do): about 400 forward passes for OIDN's base network, at any size.
+        "cone": through windows of a few pixels in a network whose layers f shows (`f.layered`, as those of
+            `progden_jax.denoisers` do): about 400 forward passes for OIDN's base network and 200 for
+            the project's KPCN, at any size.
         "auto": the cheapest of those that apply; `cost` says what each would take.
     reach : (radius, alignment) in pixels for "coloring": f(x)_q depends on x_p only within `radius`, in a way
         that repeats every `alignment` pixels. None: as f says of itself.
