@@ -125,7 +125,8 @@ def _union(spans: Sequence[np.ndarray | None]) -> np.ndarray | None:
 
 
 def multiply_adds(plan: Plan, params: Any) -> float:
-    """Multiply-adds of the tangent pass per pixel, all three channels: what `auto` compares."""
+    """Multiply-adds of the tangent pass per pixel, all three channels, without those on padding: what `auto`
+    compares."""
     total = 0.0
     for index, node in enumerate(plan.nodes):
         window = plan.windows[index]

@@ -39,8 +39,9 @@ class Exact:
             found from f's jaxpr, along rows and columns apart, at x's size; strides, pooling,
             upsampling and all that does not depend on x are followed. Where it cannot be found, an error
             names the primitive that hinders it: give `reach`, or use "basis".
-        "cone": through windows of a few pixels in a network whose layers f shows (`f.layered`, as OIDN's
-            do): about 400 forward passes for OIDN's base network, at any size.
+        "cone": through windows of a few pixels in a network whose layers f shows (`f.layered`, as those of
+            `progden_jax.denoisers` do): about 400 forward passes for OIDN's base network and 200 for
+            the project's KPCN, at any size.
         "auto": the cheapest of those that apply; `cost` says what each would take.
     reach : (radius, alignment) in pixels for "coloring": f(x)_q depends on x_p only within `radius`, in a way
         that repeats every `alignment` pixels. None: as f says of itself (`f.receptive_radius`), or found.
