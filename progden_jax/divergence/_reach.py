@@ -109,7 +109,7 @@ def _apply(equation: Any, inputs: list[_Spans | None]) -> Sequence[_Spans | None
         found = [_follow(b.jaxpr, inputs[1:]) for b in equation.params["branches"]]
         return [_union_of([s for s in outs if s is not None]) for outs in zip(*found, strict=True)]
     if name in _CALLS:
-        inner = equation.params["jaxpr"]
+        inner = equation.params.get("jaxpr", equation.params.get("call_jaxpr"))
         return _follow(getattr(inner, "jaxpr", inner), inputs)
     if name == "optimization_barrier":
         return inputs
@@ -176,7 +176,10 @@ def _union_of(pieces: Sequence[_Spans]) -> _Spans | None:
     return spans[0], spans[1]
 
 
-_CALLS = ("jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint")
+_CALLS = (
+    *("jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint"),
+    *("custom_jvp_call", "custom_vjp_call"),
+)
 
 _POINTWISE = frozenset(
     {
