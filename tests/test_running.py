@@ -114,6 +114,15 @@ def test_resumed_is_uninterrupted_bit_for_bit(method, x, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["part.npz"]
 
 
+def test_chunks_change_no_bits(x):
+    found = [
+        pd.exact_divergence(NETWORK, x, x, method=pd.Exact("coloring", chunk=chunk)).divergence
+        for chunk in (5, 1, 16)
+    ]
+    np.testing.assert_array_equal(found[1], found[0])
+    np.testing.assert_array_equal(found[2], found[0])
+
+
 def test_one_compilation_per_size(x):
     def run(network, x):
         for algorithm in ("cone", "coloring"):

@@ -43,7 +43,7 @@ index. None: every output depends on all of the axis."""
 def tangent_jaxpr(f: Callable[[Any], Any], x: Any) -> core.ClosedJaxpr:
     """The program from (x, tangent) to the tangent of f(x)."""
     like = jax.ShapeDtypeStruct(x.shape, x.dtype)
-    return jax.make_jaxpr(lambda x, t: jax.jvp(f, (x,), (t,))[1])(like, like)
+    return jax.make_jaxpr(lambda x, t: jax.linearize(f, x)[1](t))(like, like)
 
 
 def radii(f: Callable[[Any], Any], x: Any) -> tuple[int, int]:

@@ -50,9 +50,9 @@ def exact_divergence(
     progress : called as ``progress(done, total)`` before the first step and after each, in units of its own
         (pixels or colours). What it raises ends the run, the checkpoint being kept.
     checkpoint : a file for what is found, written every ten seconds and when an exception, such as that of
-        Ctrl-C, ends the run. A call with equal f, x and method goes on from it, to the same bits as without
-        a break on the same machine. It stays when all is done, so that nothing is lost until the
-        result is safe: then remove it.
+        Ctrl-C, ends the run. A call with equal f, x and method goes on from it, on the same machine to the
+        same bits as without a break. A broken file is told of in the log and ignored. It stays when
+        all is done, so that nothing is lost until the result is safe: then remove it.
 
     Raises
     ------
@@ -61,8 +61,9 @@ def exact_divergence(
 
     Notes
     -----
-    Memory by cones: XLA's temporaries of one pass through the network and about 0.25 kB per pixel for OIDN's
-    base network: 2 GiB at 1920×1080 (experiments/divergence). By colours: what ``jax.linearize(f, x)`` keeps.
+    Memory by cones, OIDN's base network at 1920×1080 on a CPU: 2 GiB at its peak, the one pass through the
+    network, and 1 GiB from then on (ReLU masks, 0.25 kB per pixel). By colours: what
+    ``jax.linearize(f, x)`` keeps. A checkpoint is a padded image, 25 MB at that size.
     """
     run = ExactRun(f, x, variance, method=method)
     return run.finish(progress=progress, checkpoint=checkpoint)
