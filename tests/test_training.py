@@ -534,7 +534,7 @@ def test_data_that_will_not_do(folder, tmp_path):
 
 
 def test_configurations(tmp_path):
-    assert config.names(MixerConfig) == ("cpu", "gpu", "paper", "smoke")
+    assert config.names(MixerConfig) == ("cpu", "gpu", "multiscale", "paper", "smoke")
     loaded = {name: config.load(MixerConfig, name) for name in config.names(MixerConfig)}
     paper = loaded["paper"]
     assert (paper.steps, paper.batch, paper.peak_rate, paper.loss) == (2_300_000, 12, 2e-5, "smape")
@@ -573,7 +573,10 @@ def test_configurations(tmp_path):
         ("steps == 1", "is no TOML"),
         ("base = 'bad.toml'", "begin from each other"),
         ("base = 'nowhere.toml'", "nowhere.toml: there is no such file"),
-        ("base = 'big'", "config is 'big', expected one of cpu, gpu, paper, smoke, or a file"),
+        (
+            "base = 'big'",
+            "config is 'big', expected one of cpu, gpu, multiscale, paper, smoke, or a file",
+        ),
     ],
 )
 def test_configurations_that_will_not_do(tmp_path, monkeypatch, text, message):
