@@ -6,8 +6,10 @@ import sys
 import pytest
 from conftest import DEMO
 
+from experiments.divergence import methods
 from experiments.main_job import run as main_job
 from experiments.stability import run as stability
+from experiments.table3 import run as table3
 
 
 def test_main_job(monkeypatch, capsys):
@@ -54,3 +56,37 @@ def test_stability(monkeypatch, tmp_path):
             assert 0 < error < 1e-4
     assert (tmp_path / "found.png").stat().st_size > 10_000
     assert "| epsilon | 0.0001 |" in (tmp_path / "found.md").read_text()
+
+
+def test_methods(monkeypatch, tmp_path, capsys):
+    """On a corner of 16 pixels: probing is nearest, and a second run has nothing left to do."""
+    csv_file = tmp_path / "found.csv"
+    options = ["--data", str(DEMO), "--spp", "8", "--crop", "16", "--most", "1"]
+    command = ["methods", *options, "--denoisers", "oidn-hdr-small", "--output", str(csv_file)]
+    monkeypatch.setattr(sys, "argv", command)
+    monkeypatch.setattr(methods.pd, "enable_compilation_cache", lambda: None)
+    methods.main()
+    first = capsys.readouterr().out
+    with csv_file.open() as file:
+        rows = {row["method"]: row for row in csv.DictReader(file)}
+    assert float(rows["exact"]["error"]) == 0
+    assert 0 < float(rows["probing"]["error"]) < float(rows["differences"]["error"])
+    assert float(rows["probing"]["passes"]) == 2
+    assert (tmp_path / "found.png").stat().st_size > 10_000
+    methods.main()
+    assert capsys.readouterr().out in first
+
+
+def test_table3(monkeypatch, capsys):
+    options = ["--data", str(DEMO), "--spp", "8", "32", "--denoisers", "oidn-hdr-small"]
+    monkeypatch.setattr(sys, "argv", ["run", *options, "--mixers", "oidn-hdr"])
+    monkeypatch.setattr(table3.pd, "enable_compilation_cache", lambda: None)
+    table3.main()
+    printed = capsys.readouterr().out
+    rows = [[c.strip() for c in x.split("|")[1:-1]] for x in printed.splitlines() if "mix by" in x]
+    oracle = [
+        [c.strip() for c in x.split("|")[1:-1]] for x in printed.splitlines() if "oracle |" in x
+    ]
+    assert len(rows) == 3
+    assert all(float(row[2]) < 1 for row in rows)
+    assert all(row[3] == "100.0%" for row in oracle)
