@@ -37,8 +37,9 @@ The same command goes on where it was killed, and comes to the same weights.
 """
 
 _CONFIG = Parameter(
-    help="A named configuration (paper, cpu, gpu, smoke; of mixers also multiscale, as the shipped ones) or a file, .toml or .yaml; it may begin with "
-    'base = "cpu" and change fields [default: cpu].'
+    help="A named configuration (paper, cpu, gpu, smoke; for mixers also multiscale, which made the "
+    'shipped ones) or a file, .toml or .yaml; it may begin with base = "cpu" and change fields '
+    "[default: cpu]."
 )
 _DATA = Parameter(
     consume_multiple=True,
