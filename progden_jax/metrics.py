@@ -62,8 +62,14 @@ def smape(image: Float[Array, "h w 3"], reference: Float[Array, "h w 3"]) -> Flo
     ValueError
         If an argument is not one floating-point image, or the shapes differ.
     """
-    z, mu = _pair(image, reference)
-    return jnp.mean(jnp.abs(z - mu) / (jnp.abs(z) + jnp.abs(mu) + SMAPE_EPSILON))
+    return jnp.mean(smape_of_values(*_pair(image, reference)))
+
+
+def smape_of_values(
+    z: Float[Array, "*shape"], mu: Float[Array, "*shape"]
+) -> Float[Array, "*shape"]:
+    """|z − μ| / (|z| + |μ| + 0.01) of every value (Firmino et al. 2022, section 5.3)."""
+    return jnp.abs(z - mu) / (jnp.abs(z) + jnp.abs(mu) + SMAPE_EPSILON)
 
 
 def relmse(image: Float[Array, "h w 3"], reference: Float[Array, "h w 3"]) -> Float[Array, ""]:
@@ -82,8 +88,14 @@ def relmse(image: Float[Array, "h w 3"], reference: Float[Array, "h w 3"]) -> Fl
     ValueError
         If an argument is not one floating-point image, or the shapes differ.
     """
-    z, mu = _pair(image, reference)
-    return jnp.mean((z - mu) ** 2 / (mu**2 + RELMSE_EPSILON))
+    return jnp.mean(relmse_of_values(*_pair(image, reference)))
+
+
+def relmse_of_values(
+    z: Float[Array, "*shape"], mu: Float[Array, "*shape"]
+) -> Float[Array, "*shape"]:
+    """(z − μ)² / (μ² + 0.01) of every value."""
+    return (z - mu) ** 2 / (mu**2 + RELMSE_EPSILON)
 
 
 def ssim(image: Float[Array, "h w 3"], reference: Float[Array, "h w 3"]) -> Float[Array, ""]:

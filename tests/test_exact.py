@@ -25,7 +25,7 @@ from progden_jax.denoisers.graph import (
     Relu,
     Upsample,
 )
-from progden_jax.divergence import cone
+from progden_jax.divergence import windows
 
 
 def blur(x):
@@ -299,7 +299,7 @@ def test_auto_takes_the_cheapest(real_frame):
 def test_windows_of_oidn_are_those_of_the_design():
     params = pd.denoisers.load("oidn-hdr").params
     nodes = unet.graph(params)
-    plan = cone.plan(nodes, params)
+    plan = windows.plan(nodes, params)
     sizes = {
         node.layer: window.size
         for node, window in zip(plan.nodes, plan.windows, strict=True)

@@ -89,4 +89,4 @@ def test_table3(monkeypatch, capsys):
     ]
     assert len(rows) == 3
     assert all(float(row[2]) < 1 for row in rows)
-    assert all(row[3] == "100.0%" for row in oracle)
+    assert all(float(row[i]) < 1 for row in oracle for i in (1, 2))

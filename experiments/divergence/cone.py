@@ -15,7 +15,7 @@ import numpy as np
 import progden_jax as pd
 from experiments import _common
 from progden_jax.denoisers import graph
-from progden_jax.divergence import cone
+from progden_jax.divergence import cone, windows
 
 PHASES = 8
 """Phases timed of all; each does the same work."""
@@ -45,7 +45,7 @@ def main() -> None:
     normal = jnp.asarray(rng.random((*size, 3)), jnp.float32)
     f: Any = pd.denoisers.load(arguments.denoiser).bind(pd.Frame(color, color, normal, normal))
     nodes, params = f.layers
-    plan = cone.plan(nodes, params)
+    plan = windows.plan(nodes, params)
     cells = cone.cells_per_phase(plan, size)
 
     def primal(f: Any, x: jax.Array) -> Any:
@@ -53,39 +53,22 @@ def main() -> None:
         output, kept = graph.evaluate(shown.nodes, shown.params, shown.inputs)
         return output, cone.surround(plan, kept)
 
-    def phase(params: Any, kept: Any, index: jax.Array) -> jax.Array:
+    def phase(params: Any, kept: Any, index: jax.Array, *, chunk: int) -> jax.Array:
+        exactly = jax.lax.Precision.HIGHEST
         return cone.some_cells(
-            plan,
-            params,
-            kept,
-            size,
-            index,
-            0,
-            cells,
-            chunk=arguments.chunk,
-            precision=jax.lax.Precision.HIGHEST,
+            plan, params, kept, size, index, 0, cells, chunk=chunk, precision=exactly
         )
+
+    program = jax.jit(phase, static_argnames="chunk")
 
     forward = jax.jit(lambda f, x: f(x)).lower(f, color).compile()
     _, kept = jax.jit(primal)(f, color)
     start = time.perf_counter()
-    tangents = jax.jit(phase).lower(params, kept, jnp.int32(0)).compile()
+    tangents = program.lower(params, kept, jnp.int32(0), chunk=arguments.chunk).compile()
     compile_time = time.perf_counter() - start
 
     # XLA counts a loop's body once: operations are counted on one chunk that holds all cells of a phase.
-    counted = jax.jit(
-        lambda params, kept, index: cone.some_cells(
-            plan,
-            params,
-            kept,
-            size,
-            index,
-            0,
-            cells,
-            chunk=cells,
-            precision=jax.lax.Precision.HIGHEST,
-        )
-    ).lower(params, kept, jnp.int32(0))
+    counted = program.lower(params, kept, jnp.int32(0), chunk=cells)
     flops: Any = counted.cost_analysis()
     forward_flops: Any = forward.cost_analysis()
     operations = flops["flops"] * plan.period**2 / forward_flops["flops"]

@@ -43,10 +43,16 @@ class _Own(Network):
     """A network between log(1 + ·) transfers."""
 
     def __init__(
-        self, params: Params, inputs: tuple[str, ...], *, name: str, precision: str
+        self,
+        params: Params,
+        inputs: tuple[str, ...] = (),
+        *,
+        name: str | None = None,
+        precision: str = "highest",
     ) -> None:
         for role in inputs:
             _checks.choice("inputs", role, BUFFERS)
+        name = type(self).__name__.lower() if name is None else name
         super().__init__(params, tuple(inputs), name=name, precision=precision)
 
     def encode(self, x: Array, exposure: None) -> Array:
@@ -82,23 +88,13 @@ class UNet(_Own):
     ----------
     params : layers as of OIDN's networks, see `unet.shapes`.
     inputs : buffers taken besides the colour, in this order: some of "albedo", "normal" and "variance".
-    name : for messages.
+    name : for messages; by default the architecture's.
     precision : of the convolutions; "highest" keeps float32 on GPUs, "tensorfloat32" is about 1e-3 off.
 
     References
     ----------
     Firmino et al. 2022, section 5.1.
     """
-
-    def __init__(
-        self,
-        params: Params,
-        inputs: tuple[str, ...] = (),
-        *,
-        name: str = "unet",
-        precision: str = "highest",
-    ) -> None:
-        super().__init__(params, inputs, name=name, precision=precision)
 
     @classmethod
     def init(
@@ -107,7 +103,7 @@ class UNet(_Own):
         inputs: tuple[str, ...] = (),
         *,
         size: str = "base",
-        name: str = "unet",
+        name: str | None = None,
         precision: str = "highest",
     ) -> Self:
         """A network to train: He's random weights, zero biases.
@@ -156,17 +152,6 @@ class KPCN(_Own):
     there; on linear radiance, a mean stays a mean.
     """
 
-    def __init__(
-        self,
-        params: Params,
-        inputs: tuple[str, ...] = (),
-        *,
-        name: str = "kpcn",
-        precision: str = "highest",
-    ) -> None:
-        _kpcn_layers(params)
-        super().__init__(params, inputs, name=name, precision=precision)
-
     @classmethod
     def init(
         cls,
@@ -177,7 +162,7 @@ class KPCN(_Own):
         width: int = 80,
         layer_size: int = 5,
         kernel_size: int = 5,
-        name: str = "kpcn",
+        name: str | None = None,
         precision: str = "highest",
     ) -> Self:
         """A network to train: He's random weights, zero biases, kernels near a box at first.
@@ -202,8 +187,7 @@ class KPCN(_Own):
 
     @property
     def nodes(self) -> tuple[Node, ...]:
-        taps = self.params["kernel"]["kernel"].shape[3]
-        return _kpcn_graph(len(self.params) - 1, math.isqrt(taps))
+        return _kpcn_graph(*_kpcn_sizes(self.params))
 
     def decode(self, y: Array, exposure: None) -> Array:
         del exposure
@@ -221,7 +205,8 @@ def _kpcn_graph(layers: int, size: int) -> tuple[Node, ...]:
     return tuple(nodes)
 
 
-def _kpcn_layers(params: Params) -> None:
+def _kpcn_sizes(params: Params) -> tuple[int, int]:
+    """Hidden layers, and the edge of the predicted kernels."""
     expected = {"kernel", *(f"conv{n}" for n in range(1, len(params)))}
     if len(params) < 2 or set(params) != expected:
         raise ValueError(
@@ -233,6 +218,7 @@ def _kpcn_layers(params: Params) -> None:
         raise ValueError(
             f"the layer kernel predicts {taps} logits per pixel; expected an odd number squared, such as 25."
         )
+    return len(params) - 1, math.isqrt(taps)
 
 
 ARCHITECTURES: dict[str, type[UNet] | type[KPCN]] = {"unet": UNet, "kpcn": KPCN}

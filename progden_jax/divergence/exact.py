@@ -13,15 +13,15 @@ from jaxtyping import Array, Float
 
 from progden_jax import _checks
 from progden_jax.denoisers import graph
-from progden_jax.divergence import _reach, cone
+from progden_jax.divergence import _reach, cone, windows
 from progden_jax.divergence._base import Evaluation, Function
 
 ALGORITHMS = ("auto", "basis", "coloring", "cone")
 
-logger = logging.getLogger(__name__)
-
-
 COLORS_AT_ONCE = 4
+"""Tangents at once, by unit vectors and colours, unless `chunk` says otherwise."""
+
+logger = logging.getLogger(__name__)
 
 
 @jax.tree_util.register_static
@@ -110,8 +110,8 @@ class Exact:
             costs["coloring"] = float(self.colors(f, x, "coloring").max() + 1)
         if hasattr(f, "layered"):
             nodes, params = f.layers  # pyright: ignore[reportFunctionMemberAccess]
-            plan = cone.plan(nodes, params)
-            costs["cone"] = cone.multiply_adds(plan, params) / graph.multiply_adds(nodes, params)
+            plan = windows.plan(nodes, params)
+            costs["cone"] = windows.multiply_adds(plan, params) / graph.multiply_adds(nodes, params)
         return costs
 
     def colors(self, f: Function, x: Float[Array, "h w 3"], algorithm: str) -> np.ndarray:
@@ -143,7 +143,7 @@ class Exact:
         layered: graph.Layered = f.layered(x)  # pyright: ignore[reportFunctionMemberAccess]
         value, slope, kept = cone_primal(layered, x)
         diagonal = cone.jacobian_diagonal(
-            cone.plan(layered.nodes, layered.params),
+            windows.plan(layered.nodes, layered.params),
             layered.params,
             kept,
             (layered.inputs.shape[0], layered.inputs.shape[1]),

@@ -15,8 +15,9 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from progden_jax._fingerprint import fingerprint
 from progden_jax.denoisers import graph
-from progden_jax.divergence import _checkpoint, _reach, cone, exact
+from progden_jax.divergence import _checkpoint, _reach, cone, exact, windows
 from progden_jax.divergence._base import Evaluation, Function, check_arguments
 from progden_jax.divergence.exact import Exact
 
@@ -170,11 +171,12 @@ class _ByCone:
         self.nodes = tuple(f.layers[0])
         run = _closed(_cone_primal, f)
         self.value, self.slope, self.kept, self.params, inputs, inside = run(f, x)
-        self.key = _checkpoint.fingerprint(
-            "cone", repr(self.nodes), self.params, inputs, [] if inside is None else inside
+        extent = [] if inside is None else inside
+        self.key = fingerprint(
+            _checkpoint.FORMAT, "cone", repr(self.nodes), self.params, inputs, extent
         )
         self.size = (inputs.shape[0], inputs.shape[1])
-        self.plan = cone.plan(self.nodes, self.params)
+        self.plan = windows.plan(self.nodes, self.params)
         self.cells = cone.cells_per_phase(self.plan, self.size)
         self.total = self.cells * self.plan.period**2
         self.found = np.zeros((self.total, 3), x.dtype)
@@ -211,7 +213,7 @@ class _ByColors:
     def __init__(self, f: Any, x: Array, method: Exact, algorithm: str) -> None:
         self.colors = method.colors(f, x, algorithm)
         jaxpr = _reach.tangent_jaxpr(f, x)
-        self.key = _checkpoint.fingerprint("colors", self.colors, jaxpr, x)
+        self.key = fingerprint(_checkpoint.FORMAT, "colors", self.colors, jaxpr, x)
         self.value, self.tangent = _closed(jax.linearize, f)(f, x)
         self.total = int(self.colors.max()) + 1
         self.found = np.zeros(x.shape, x.dtype)
@@ -246,7 +248,7 @@ def _compiled(run: Callable[..., Any]) -> Callable[..., Any]:
 def _cone_primal(f: Any, x: Array) -> tuple[Any, ...]:
     layered: graph.Layered = f.layered(x)
     value, slope, kept = exact.cone_primal(layered, x)
-    kept = cone.surround(cone.plan(layered.nodes, layered.params), kept)
+    kept = cone.surround(windows.plan(layered.nodes, layered.params), kept)
     return value, slope, kept, layered.params, layered.inputs, layered.inside
 
 
@@ -263,7 +265,7 @@ def _cone_step(
     chunk: int,
 ) -> Float[Array, "cells 3"]:
     return cone.some_cells(
-        cone.plan(nodes, params),
+        windows.plan(nodes, params),
         params,
         kept,
         size,

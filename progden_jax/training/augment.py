@@ -7,7 +7,7 @@ belongs to the changed example. Three things are worth knowing:
   another denoiser (the first between the change and its inverse) makes of the changed render, with that
   denoiser's divergence: as good to learn mixing from.
 - That holds for a change of exposure only if the denoiser itself follows it, f(s·x) = s·f(x). OIDN does
-  as long as it chooses its own exposure; `ExposureError` says so for others.
+  as long as it chooses its own exposure; `MixerTask` refuses others.
 - Normals are in world space, so that neither mirroring nor turning the picture changes them.
 """
 

@@ -3,7 +3,6 @@
 import hashlib
 import json
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import jax
@@ -57,15 +56,8 @@ class Checkpoints:
         leaves = self._manager.restore(step, args=self._ocp.args.StandardRestore(form))
         return jax.tree.unflatten(jax.tree.structure(like), [leaves[name] for name in form])
 
-    def __enter__(self) -> "Checkpoints":
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        at: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
+        """Wait for what is being written."""
         self._manager.close()
 
 

@@ -3,7 +3,6 @@
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from types import TracebackType
 
 from progden_jax._files import replacing
 
@@ -38,15 +37,8 @@ class Curves:
         self._lines.write(json.dumps({"step": step, **values}) + "\n")
         self._lines.flush()
 
-    def __enter__(self) -> "Curves":
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        at: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
+        """Write what is still held."""
         self._lines.close()
         self._events.close()
 

@@ -4,7 +4,6 @@ They depend on render, denoiser, method and seed alone, and cost far more than a
 """
 
 import functools
-import hashlib
 import os
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,13 +15,14 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from progden_jax._files import replacing
+from progden_jax._fingerprint import fingerprint
 from progden_jax._numeric import safe_sqrt
 from progden_jax.compilation import cache_folder
 from progden_jax.denoisers import Denoiser
 from progden_jax.divergence import Method
 from progden_jax.frame import Frame
 
-_VERSION = 1
+_VERSION = 2
 """Part of every key: raise it when the arithmetic changes, so that old entries are left alone."""
 
 
@@ -70,14 +70,14 @@ class EstimateCache:
         self._fields = Estimate._fields if tangents else Estimate._fields[:2]
         kind, structure = type(denoiser).__qualname__, str(jax.tree.structure(denoiser))
         self.stores = " at 0x" not in structure
-        self._settings = _digest(_VERSION, kind, structure, repr(method), self._fields)
-        for leaf in jax.tree.leaves(denoiser):
-            self._settings = _digest(self._settings, np.asarray(leaf))
+        self._settings = fingerprint(
+            _VERSION, kind, structure, repr(method), self._fields, denoiser
+        )
 
     def key(self, frame: Frame, seed: int) -> str:
         """Equal for equal buffers, denoiser (its weights included), method and seed; else different."""
         buffers = (frame.color, frame.variance, frame.albedo, frame.normal, frame.depth)
-        return _digest(self._settings, seed, *buffers)
+        return fingerprint(self._settings, seed, buffers)
 
     def get(self, frame: Frame, seed: int = 0) -> Estimate:
         """The estimate for a repaired frame; `seed` is of the random probes."""
@@ -93,7 +93,7 @@ class EstimateCache:
         if self.stores:
             self.folder.mkdir(parents=True, exist_ok=True)
             with replacing(path) as temporary:
-                temporary.write_bytes(save(arrays, {"digest": _digest(*arrays.values())}))
+                temporary.write_bytes(save(arrays, {"digest": fingerprint(*arrays.values())}))
         return Estimate(**arrays)
 
     def _read(self, path: Path, shape: tuple[int, ...]) -> Estimate | None:
@@ -104,7 +104,7 @@ class EstimateCache:
         except (OSError, KeyError, SafetensorError):
             return None
         whole = all(a.shape == shape for a in arrays.values())
-        return Estimate(**arrays) if whole and _digest(*arrays.values()) == digest else None
+        return Estimate(**arrays) if whole and fingerprint(*arrays.values()) == digest else None
 
 
 @functools.partial(jax.jit, static_argnames=("method", "tangents"))
@@ -119,15 +119,3 @@ def _estimate(
     signs = jax.random.rademacher(jax.random.fold_in(key, 2**31), y.shape, y.dtype)
     probe = safe_sqrt(frame.variance) * signs
     return y, divergence, probe, jax.jvp(f, (frame.color,), (probe,))[1]
-
-
-def _digest(*parts: Any) -> str:
-    hashed = hashlib.blake2b(digest_size=20)
-    for part in parts:
-        if hasattr(part, "dtype"):
-            array = np.ascontiguousarray(part)
-            hashed.update(f"{array.dtype}{array.shape};".encode())
-            hashed.update(array.data)
-        else:
-            hashed.update(f"{part!r};".encode())
-    return hashed.hexdigest()

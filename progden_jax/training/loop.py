@@ -5,6 +5,7 @@ import os
 import subprocess
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -92,10 +93,10 @@ class Trainer:
         """Train to the end of the schedule, or go on with what `folder` holds; see `train`."""
         task, config, folder = self.task, self.task.config, Path(folder)
         claim(folder, describe(task.kind, config, task.items))
-        with Checkpoints(folder) as checkpoints:
+        with closing(Checkpoints(folder)) as checkpoints:
             state = jax.device_put(self._start(self._key), self._everywhere)
             state = checkpoints.restore(state) or state
-            with Curves(folder, int(state.step)) as curves:
+            with closing(Curves(folder, int(state.step))) as curves:
                 outlets = _Outlets(folder, curves, checkpoints, report)
                 state = self._loop(state, min(config.steps, until or config.steps), outlets)
         early = _exhausted(state, config) and int(state.step) < config.steps

@@ -6,17 +6,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from progden_jax.metrics import relmse_of_values, smape_of_values
+
 Loss = Callable[[Array, Array], Array]
-
-
-def smape(z: Float[Array, "..."], reference: Float[Array, "..."]) -> Float[Array, "..."]:
-    """|z − μ| / (|z| + |μ| + 0.01), the paper's loss (section 5.3)."""
-    return jnp.abs(z - reference) / (jnp.abs(z) + jnp.abs(reference) + 0.01)
-
-
-def relmse(z: Float[Array, "..."], reference: Float[Array, "..."]) -> Float[Array, "..."]:
-    """(z − μ)² / (μ² + 0.01)."""
-    return (z - reference) ** 2 / (reference**2 + 0.01)
 
 
 def l1(z: Float[Array, "..."], reference: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -43,7 +35,7 @@ def log_errors(
 
     def both(image: Array) -> tuple[Array, Array]:
         axes = (-3, -2, -1)
-        return smape(image, reference).mean(axes), ((image - reference) ** 2).mean(axes)
+        return smape_of_values(image, reference).mean(axes), ((image - reference) ** 2).mean(axes)
 
     relative, squared = both(z)
     least_relative, least_squared = (
@@ -55,7 +47,12 @@ def log_errors(
     )
 
 
-SUPERVISED: dict[str, Loss] = {"smape": smape, "relmse": relmse, "l1": l1, "logl1": logl1}
+SUPERVISED: dict[str, Loss] = {
+    "smape": smape_of_values,
+    "relmse": relmse_of_values,
+    "l1": l1,
+    "logl1": logl1,
+}
 """Losses against a reference, by their names in configurations."""
 
 

@@ -142,8 +142,8 @@ def make_step(task: Task, mesh: Mesh | None = None) -> Step:
         params = optax.apply_updates(state.params, updates)
         # The average's memory grows with the steps, so that it forgets the start.
         decay = jnp.minimum(config.ema, (1 + state.step) / (10 + state.step))
-        average = jax.tree.map(lambda a, p: decay * a + (1 - decay) * p, state.average, params)
-        scalars = {"loss": loss, "gradient": _norm(found), **curves}
+        average = optax.incremental_update(params, state.average, 1 - decay)
+        scalars = {"loss": loss, "gradient": optax.tree.norm(found), **curves}
         changed = {
             "step": state.step + 1,
             "params": params,
@@ -153,10 +153,6 @@ def make_step(task: Task, mesh: Mesh | None = None) -> Step:
         return state._replace(**changed), scalars
 
     return jax.jit(step, donate_argnums=0)
-
-
-def _norm(tree: Any) -> Array:
-    return jnp.sqrt(sum(jnp.vdot(leaf, leaf) for leaf in jax.tree.leaves(tree)))
 
 
 @jax.jit

@@ -1,0 +1,160 @@
+"""Which pixels of every layer matter for ∂f_p/∂x_p, and how many products they take: see `cone`."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from progden_jax.denoisers import graph as g
+
+
+@dataclasses.dataclass(frozen=True)
+class Window:
+    """Where along one axis a node's window begins, per phase, in the node's own pixels and relative
+    to the one above p, and how many pixels it spans (the most over phases)."""
+
+    origin: np.ndarray
+    size: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """The windows of a graph: what `jacobian_diagonal` runs and what its cost follows from."""
+
+    nodes: tuple[g.Node, ...]
+    levels: tuple[int, ...]
+    windows: tuple[Window | None, ...]
+    """None where no path from p to p leads through a node."""
+
+    @property
+    def period(self) -> int:
+        """Pixels after which the windows repeat."""
+        return 1 << max(self.levels)
+
+
+def plan(nodes: Sequence[g.Node], params: Any) -> Plan:
+    """The windows of every node: forward cone of one input pixel, met with its backward cone.
+
+    Both are intervals per axis and phase. Convolutions widen them, pooling and upsampling halve
+    and double the positions, rounding as the phase has it.
+    """
+    levels = g.levels(nodes)
+    phases = np.arange(1 << max(levels))
+    # Absolute positions, for a pixel p equal to its phase plus a multiple of every stride.
+    forward: list[np.ndarray | None] = []
+    for node in nodes:
+        spans = [forward[s] for s in g.sources(node)]
+        match node:
+            case g.Input():
+                span = np.stack([phases, phases])
+            case g.Conv():
+                r = _radius(params, node)
+                span = _union([s if s is None else s + np.array([[-r], [r]]) for s in spans])
+            case g.MaxPool():
+                span = None if spans[0] is None else spans[0] >> 1
+            case g.Upsample():
+                span = None if spans[0] is None else 2 * spans[0] + np.array([[0], [1]])
+            case g.Filter():
+                image, r = forward[node.image], node.size // 2
+                reached = None if image is None else image + np.array([[-r], [r]])
+                span = _union([reached, forward[node.logits]])
+            case _:
+                span = _union(spans)
+        forward.append(span)
+
+    backward: list[np.ndarray | None] = [None] * len(nodes)
+    backward[-1] = np.stack([phases, phases])
+    for index in reversed(range(len(nodes))):
+        span, node = backward[index], nodes[index]
+        if span is None:
+            continue
+        match node:
+            case g.Conv():
+                r = _radius(params, node)
+                needed = span + np.array([[-r], [r]])
+            case g.MaxPool():
+                needed = 2 * span + np.array([[0], [1]])
+            case g.Upsample():
+                needed = span >> 1
+            case g.Filter():
+                needed, r = span, node.size // 2
+                around = span + np.array([[-r], [r]])
+                backward[node.image] = _union([backward[node.image], around])
+            case _:
+                needed = span
+        for source in g.sources(node):
+            backward[source] = _union([backward[source], needed])
+
+    windows: list[Window | None] = []
+    for level, ahead, behind in zip(levels, forward, backward, strict=True):
+        if ahead is None or behind is None:
+            windows.append(None)
+            continue
+        low, high = np.maximum(ahead[0], behind[0]), np.minimum(ahead[1], behind[1])
+        size = int((high - low).max()) + 1
+        low, high = low - (phases >> level), high - (phases >> level)
+        # Where smaller windows leave room, one origin for all phases makes offsets static.
+        if (high - size + 1).max() <= low.min():
+            low = np.full_like(low, low.min())
+        windows.append(Window(low, size) if size > 0 else None)
+    return Plan(tuple(nodes), tuple(levels), tuple(windows))
+
+
+def _radius(params: Any, node: g.Conv) -> int:
+    return params[node.layer]["kernel"].shape[0] // 2
+
+
+def _union(spans: Sequence[np.ndarray | None]) -> np.ndarray | None:
+    known = [span for span in spans if span is not None]
+    if not known:
+        return None
+    return np.stack([np.min([s[0] for s in known], 0), np.max([s[1] for s in known], 0)])
+
+
+def multiply_adds(plan: Plan, params: Any) -> float:
+    """Multiply-adds of the tangent pass per pixel, all three channels, without those on padding: what `auto`
+    compares."""
+    total = 0.0
+    for index, node in enumerate(plan.nodes):
+        window = plan.windows[index]
+        if not isinstance(node, g.Conv) or window is None:
+            continue
+        kernel = params[node.layer]["kernel"]
+        for source, part in zip(node.sources, split_channels(plan, params, node), strict=True):
+            origin = plan.windows[source]
+            if origin is None:
+                continue
+            if isinstance(plan.nodes[source], g.Upsample):
+                taps = (window.size * (kernel.shape[0] + 1) // 2) ** 2
+            elif shifting(origin, window):
+                taps = (kernel.shape[0] * min(origin.size, window.size)) ** 2
+            else:
+                taps = sum(_overlap(origin, window, tap) for tap in _taps(kernel.shape[0])) ** 2
+            total += (
+                3 * taps * part.stop * kernel.shape[3] - 3 * taps * part.start * kernel.shape[3]
+            )
+    return total
+
+
+def split_channels(plan: Plan, params: Any, node: g.Conv) -> list[slice]:
+    """The input channels of a convolution that belong to each of its sources."""
+    widths = g.channels(plan.nodes, params)
+    ends = np.cumsum([widths[source] for source in node.sources])
+    return [slice(int(e) - widths[s], int(e)) for e, s in zip(ends, node.sources, strict=True)]
+
+
+def _taps(size: int) -> range:
+    return range(-(size // 2), size // 2 + 1)
+
+
+def shifting(source: Window, target: Window) -> bool:
+    """Whether the offset between two windows differs between phases."""
+    shifts = target.origin - source.origin
+    return bool((shifts != shifts[0]).any())
+
+
+def _overlap(source: Window, target: Window, tap: int) -> int:
+    """How many target pixels o read a source pixel o + tap, for windows at one offset in every phase."""
+    shift = int(target.origin[0] - source.origin[0]) + tap
+    return max(min(target.size, source.size - shift) - max(0, -shift), 0)
