@@ -688,7 +688,7 @@ def test_training_a_denoiser(folder, tmp_path):
 
 
 def test_denoiser_configurations(folder):
-    assert config.names(DenoiserConfig) == ("cpu", "gpu", "paper", "smoke")
+    assert config.names(DenoiserConfig) == ("cpu", "gpu", "kpcn", "paper", "small", "smoke")
     for name in config.names(DenoiserConfig):
         config.load(DenoiserConfig, name)
     for changes, message in (

@@ -4,7 +4,6 @@ import contextlib
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Parameter
@@ -37,9 +36,9 @@ The same command goes on where it was killed, and comes to the same weights.
 """
 
 _CONFIG = Parameter(
-    help="A named configuration (paper, cpu, gpu, smoke; for mixers also multiscale, which made the "
-    'shipped ones) or a file, .toml or .yaml; it may begin with base = "cpu" and change fields '
-    "[default: cpu]."
+    help="A named configuration (paper, cpu, gpu, smoke; those that made what is shipped: for mixers "
+    "multiscale, for denoisers small and kpcn) or a file, .toml or .yaml; it may begin with "
+    'base = "cpu" and change fields [default: cpu].'
 )
 _DATA = Parameter(
     consume_multiple=True,
@@ -135,7 +134,7 @@ def _train(
     enable_compilation_cache()
     with _loading() as progress:
         task = make(progress)
-    with _Report(quiet=json) as report:
+    with contextlib.closing(_Report(quiet=json)) as report:
         outcome = train(task, output, report=report, until=until)
     step, best = int(outcome.state.step), int(outcome.state.best_step)
     if json:
@@ -193,6 +192,7 @@ class _Report:
             speed_estimate_period=300,
         )
         self._task = self._bar.add_task("", total=None, text="")
+        self._bar.start()
 
     def started(self, step: int, steps: int) -> None:
         self._bar.reset(self._task, total=steps, completed=step, text="compiling")
@@ -214,16 +214,7 @@ class _Report:
         else:
             self._bar.console.print(line, markup=False, highlight=False, soft_wrap=True)
 
-    def __enter__(self) -> "_Report":
-        self._bar.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        at: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
         self._bar.stop()
 
 
