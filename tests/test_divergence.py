@@ -166,9 +166,31 @@ def test_random_numbers_belong_to_pixels(draw):
     large = draw(key, 2, jnp.zeros((9, 16, 3)))
     np.testing.assert_array_equal(large[:5, :6], small)
     assert not np.array_equal(draw(key, 3, jnp.zeros((5, 6, 3))), small)
-    many = np.asarray(draw(key, 0, jnp.zeros((100, 100, 3))))
-    assert abs(many.mean()) < 5 / np.sqrt(many.size)
-    assert abs((many**2).mean() - 1) < 5 * np.sqrt(2 / many.size)
+
+
+def test_random_numbers_have_their_moments_and_do_not_follow_one_another():
+    """In standard errors: values, products of neighbours, of probes and keys, of four at a rectangle."""
+    like = jnp.zeros((128, 128, 3))
+    keys = [jax.random.key(0), jax.random.key(1), jax.random.key(1, impl="rbg")]
+    keys += list(jax.random.split(jax.random.key(0), 2))
+    draw = jax.jit(_random.signs)
+    drawn = np.stack([[np.asarray(draw(key, probe, like)) for probe in range(4)] for key in keys])
+    assert set(np.unique(drawn)) == {-1, 1}
+    found = [drawn, drawn[:, 1:] * drawn[:, :-1], drawn[1:] * drawn[:-1]]
+    for rows, columns in ((0, 1), (1, 0), (1, 1), (3, 8), (64, 32)):
+        cut = drawn[:, :, rows:, columns:], drawn[:, :, : 128 - rows, : 128 - columns]
+        across = drawn[:, :, rows:, : 128 - columns] * drawn[:, :, : 128 - rows, columns:]
+        found += [cut[0] * cut[1]]
+        if rows and columns:
+            found += [cut[0] * cut[1] * across]
+    found += [drawn[..., :2] * drawn[..., 1:], drawn.prod(-1)]
+    for values in found:
+        sums = values.sum(tuple(range(2, values.ndim))) / np.sqrt(np.prod(values.shape[2:]))
+        assert np.abs(sums).max() < 5
+    values = np.asarray(_random.normal(keys[0], 0, like), np.float64).ravel()
+    for power, moment, variance in ((1, 0, 1), (2, 1, 2), (3, 0, 15), (4, 3, 96), (6, 15, 10170)):
+        error = (values**power).mean() - moment
+        assert abs(error) < 5 * np.sqrt(variance / values.size)
 
 
 def test_zero_variance_gives_zero_and_finite_gradients(x):

@@ -22,7 +22,7 @@ from progden_jax.denoisers import Denoiser
 from progden_jax.divergence import Method
 from progden_jax.frame import Frame
 
-_VERSION = 2
+_VERSION = 3
 """Part of every key: raise it when the arithmetic changes, so that old entries are left alone."""
 
 
