@@ -33,6 +33,10 @@ def images() -> SimpleNamespace:
     return SimpleNamespace(x=x, y=y, variance=variance, divergence=divergence)
 
 
+divergence = jax.jit(pd.divergence, static_argnames=("f", "method"))
+"""Compiled whole, for functions that are no pytrees: run eagerly, each operation becomes a program."""
+
+
 @contextlib.contextmanager
 def counting_compilations() -> Iterator[list[str]]:
     """The names of the programs compiled within the block."""

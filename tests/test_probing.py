@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import counting_compilations, dense_jacobian_diagonal
+from conftest import counting_compilations, dense_jacobian_diagonal, divergence
 
 import progden_jax as pd
 from progden_jax.divergence import _random, evaluate
@@ -84,7 +84,7 @@ def test_colors_belong_to_positions():
 @pytest.mark.parametrize("probes", [1, 2, 3, 7, 16, 100])
 @pytest.mark.parametrize("scale", SCALES)
 def test_exact_for_pointwise_functions(probes, scale, x, variance):
-    found = pd.divergence(
+    found = divergence(
         lambda x: x**2, x, variance, method=pd.Probing(probes=probes, scale=scale)
     )
     np.testing.assert_allclose(found, 2 * x * variance, rtol=1e-5)
@@ -95,7 +95,7 @@ def test_exact_for_a_local_filter_once_its_footprint_is_covered(scale, x, varian
     truth = np.asarray(variance) * dense_jacobian_diagonal(near, np.asarray(x))
     errors = {}
     for count in (8, 16, 64):
-        found = pd.divergence(near, x, variance, method=pd.Probing(probes=count, scale=scale))
+        found = divergence(near, x, variance, method=pd.Probing(probes=count, scale=scale))
         errors[count] = np.abs(np.asarray(found) - truth).max() / np.abs(truth).max()
     # The 27 values that a 3×3 filter sees hold no second one of the own colour out of 16.
     assert errors[8] > 1e-2
@@ -114,7 +114,7 @@ def test_nested(x, variance):
         b = weight * signs * np.asarray(walsh(k, colors(*SIZE[:2])))
         contributions.append(sigma**2 / weight**2 * b * np.asarray(near(jnp.asarray(b))))
     for count in (1, 2, 3, 4, 8, 11):
-        found = pd.divergence(near, x, variance, method=pd.Probing(probes=count), key=key)
+        found = divergence(near, x, variance, method=pd.Probing(probes=count), key=key)
         expected = np.mean(contributions[:count], axis=0)
         np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(contributions[0]).max())
 
@@ -127,7 +127,7 @@ def test_unbiased_at_every_number_of_probes(x, variance):
             method = pd.Probing(probes=count, scale=scale)
             found = jax.jit(
                 jax.vmap(
-                    lambda key, method=method: pd.divergence(
+                    lambda key, method=method: divergence(
                         near, x, variance, method=method, key=key
                     )
                 )
@@ -154,7 +154,7 @@ def test_variance_is_the_closed_form(x, variance):
         method = pd.Probing(probes=count)
         found = jax.jit(
             jax.vmap(
-                lambda key, method=method: pd.divergence(near, x, variance, method=method, key=key)
+                lambda key, method=method: divergence(near, x, variance, method=method, key=key)
             )
         )(keys)
         measured = np.asarray(found, np.float64).reshape(len(keys), n).var(0, ddof=1)

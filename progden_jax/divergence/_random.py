@@ -43,6 +43,7 @@ def _bits(
     return _hash(row, column, channel, d)[3]
 
 
+@jax.jit
 def normal(
     key: jax.Array, probe: Array | int, like: Float[Array, "h w c"]
 ) -> Float[Array, "h w c"]:
@@ -52,6 +53,7 @@ def normal(
     return 2**0.5 * lax.erf_inv(uniform)
 
 
+@jax.jit
 def signs(key: jax.Array, probe: Array | int, like: Float[Array, "h w c"]) -> Float[Array, "h w c"]:
     """Values ±1 with equal probability for the probe of this number."""
     return 1 - 2 * (_bits(key, probe, like) >> 31).astype(like.dtype)
