@@ -84,9 +84,7 @@ def test_colors_belong_to_positions():
 @pytest.mark.parametrize("probes", [1, 2, 3, 7, 16, 100])
 @pytest.mark.parametrize("scale", SCALES)
 def test_exact_for_pointwise_functions(probes, scale, x, variance):
-    found = divergence(
-        lambda x: x**2, x, variance, method=pd.Probing(probes=probes, scale=scale)
-    )
+    found = divergence(lambda x: x**2, x, variance, method=pd.Probing(probes=probes, scale=scale))
     np.testing.assert_allclose(found, 2 * x * variance, rtol=1e-5)
 
 
@@ -127,9 +125,7 @@ def test_unbiased_at_every_number_of_probes(x, variance):
             method = pd.Probing(probes=count, scale=scale)
             found = jax.jit(
                 jax.vmap(
-                    lambda key, method=method: divergence(
-                        near, x, variance, method=method, key=key
-                    )
+                    lambda key, method=method: divergence(near, x, variance, method=method, key=key)
                 )
             )(keys)
             found = np.asarray(found, np.float64)
