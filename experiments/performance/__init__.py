@@ -1,0 +1,1 @@
+"""Run time, by one command each: see the README."""

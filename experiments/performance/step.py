@@ -1,0 +1,132 @@
+"""What one step of training a mixer costs against its operations at the speed of a large convolution.
+
+python -m experiments.performance.step [--architectures paper multiscale]
+
+Batch 12 of 128×128. The operations are three times the forward pass's multiply-adds (forward, kernels,
+inputs; the first layer needs no inputs'), two each. In one run, in turn, the least of many times.
+"""
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import progden_jax as pd
+from experiments import _common
+from progden_jax import mixers
+from progden_jax.training import MixerConfig, MixerTask, config
+from progden_jax.training.step import make_start, make_step
+
+TARGET = 1.2
+TRAIN = _common.VALID.parent / "train"
+
+
+def operations(params: Any, pixels: int) -> float:
+    """Of the convolutions with these weights, forward and backward over so many pixels."""
+    layers = [layer["kernel"] for layer in params.values()]
+    products = [float(np.prod(kernel.shape)) * pixels for kernel in layers]
+    return 2 * (3 * sum(products) - products[0])
+
+
+def convolution(batch: int, size: int, channels: int) -> tuple[Any, tuple[Any, ...], float]:
+    """A 3×3 convolution, its arguments and its operations."""
+    image = jnp.ones((batch, size, size, channels))
+    kernel = jnp.full((3, 3, channels, channels), 0.01)
+
+    @jax.jit
+    def run(image: jax.Array, kernel: jax.Array) -> jax.Array:
+        return jax.lax.conv_general_dilated(
+            image, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
+        )
+
+    return run, (image, kernel), 2.0 * image.size * 9 * channels
+
+
+def task_on_some(data: Path, architecture: str, scenes: int, folder: Path) -> MixerTask:
+    """Training on a few scenes: a step takes as long on any number of them."""
+    for name in _common.scenes(data, scenes):
+        for path in data.glob(f"{name}_*spp.exr"):
+            link = folder / path.name
+            if not link.exists():
+                link.symlink_to(path.resolve())
+    values: dict[str, Any] = {"data": [str(folder)], "crop": 128, "batch": 12}
+    values |= {"architecture": architecture, "denoiser": "oidn-hdr-small"}
+    if architecture == "multiscale":
+        values |= {"loss": "log-errors", "swap": 0.0}
+    return MixerTask(config.load(MixerConfig, "cpu", values), cache_folder=folder / "cache")
+
+
+def seconds(run: Any, repeats: int) -> list[float]:
+    """Of each call, the first left out, for it compiles."""
+    jax.block_until_ready(run())
+    found = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        jax.block_until_ready(run())
+        found.append(time.perf_counter() - begin)
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--data", type=Path, default=TRAIN, help="folder of training renders")
+    parser.add_argument("--scenes", type=int, default=3, help="how many of its scenes to load")
+    parser.add_argument("--architectures", nargs="*", default=tuple(mixers.ARCHITECTURES))
+    parser.add_argument("--repeats", type=int, default=10)
+    parser.add_argument("--channels", type=int, default=96, help="of the convolution compared with")
+    arguments = parser.parse_args()
+    pd.enable_compilation_cache()
+    print(_common.machine(), flush=True)
+    large, images, count = convolution(1, 512, arguments.channels)
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for architecture in arguments.architectures:
+            task = task_on_some(arguments.data, architecture, arguments.scenes, Path(folder))
+            state, step = make_start(task)(jax.random.key(0)), make_step(task, None)
+            arrays = jax.device_put(dict(task.arrays))
+            chosen = jnp.arange(task.config.batch) % len(task.items)
+
+            def once(state: Any = state, step: Any = step, a: Any = arrays, c: Any = chosen) -> Any:
+                copied = jax.tree.map(jnp.copy, state)  # a step takes over its state's memory
+                return step(copied, a, jax.random.key(0), c)
+
+            peaks, times = [], []
+            seconds(once, 1)
+            for _ in range(arguments.repeats):
+                peaks += seconds(lambda: large(*images), 2)
+                times += seconds(once, 1)
+            speed = count / min(peaks)
+            total = operations(state.params, task.config.batch * task.config.crop**2)
+            limit = total / speed
+            rows.append(
+                (
+                    architecture,
+                    f"{total / 1e9:.1f}",
+                    f"{speed / 1e9:.0f}",
+                    f"{limit * 1e3:.0f}",
+                    f"{min(times) * 1e3:.0f}",
+                    f"{min(times) / limit:.2f}",
+                    TARGET,
+                )
+            )
+    header = (
+        "architecture",
+        "operations, 1e9",
+        f"3×3 convolution of {arguments.channels} channels, GFLOP/s",
+        "limit, ms",
+        "step, ms",
+        "step / limit",
+        "target",
+    )
+    print(_common.markdown(header, rows))
+
+
+if __name__ == "__main__":
+    main()
