@@ -124,7 +124,7 @@ class Probing:
         key: jax.Array,
     ) -> Evaluation:
         value, tangent = jax.linearize(f, x)
-        weight, gain = _weight_and_gain(safe_sqrt(variance), value, self.scale)
+        weight, gain = weight_and_gain(safe_sqrt(variance), value, self.scale)
         pixel_colors = colors(*x.shape[:2])
         probes, replicates = self._counts
         each = probes // replicates
@@ -184,8 +184,10 @@ def deflated(
     stay above 0.7. (What reaches far depends on Σ σ² alone; structured probes fall as 1/K.)
     """
     most = probes // 4
-    top, index = lax.top_k(lax.stop_gradient(variance).ravel(), min(most, variance.size))
-    total = lax.stop_gradient(variance).sum()
+    # The barrier keeps XLA from sorting a constant variance while it compiles, which takes minutes.
+    values = lax.optimization_barrier(lax.stop_gradient(variance).ravel())
+    top, index = lax.top_k(values, min(most, values.size))
+    total = values.sum()
     held = jnp.concatenate([jnp.zeros(1, top.dtype), jnp.cumsum(top)])
     # Below what sums in float32 can tell, fewer are as good.
     left = jnp.maximum(1 - held / jnp.where(total > 0, total, 1), 1e-5)
@@ -212,7 +214,7 @@ def walsh(probe: Array | int, color: Int[Array, "h w 3"]) -> Int[Array, "h w 3"]
     return 1 - 2 * (lax.population_count(shared) & 1)
 
 
-def _weight_and_gain(sigma: Array, value: Array, scale: str) -> tuple[Array, Array]:
+def weight_and_gain(sigma: Array, value: Array, scale: str) -> tuple[Array, Array]:
     """w, and σ²/w; formed apart so that nothing under- or overflows between 1e-6 and 1e6."""
     if scale == "unit":
         return jnp.ones_like(sigma), sigma**2
