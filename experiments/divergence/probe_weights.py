@@ -36,7 +36,7 @@ class Columns(NamedTuple):
     """Sampled columns of a Jacobian, squared and without their diagonal, and what belongs to them."""
 
     squares: np.ndarray
-    index: np.ndarray
+    places: np.ndarray
     share: np.ndarray
     sigma: np.ndarray
     value: np.ndarray
@@ -52,9 +52,8 @@ def sample(frame: pd.Frame, denoiser: pd.Denoiser) -> Columns:
     sigma = np.sqrt(variance)
     order = np.argsort(-sigma)
     rest = order[LARGEST:]
-    chance = 0.3 / rest.size + sum(
-        p * a[rest] / a[rest].sum() for p, a in ((0.4, sigma), (0.3, variance))
-    )
+    chance = 0.3 / rest.size + 0.4 * sigma[rest] / sigma[rest].sum()
+    chance += 0.3 * variance[rest] / variance[rest].sum()
     drawn = np.random.default_rng(0).choice(rest.size, size=DRAWN, p=chance)
     index = np.concatenate([order[:LARGEST], rest[drawn]])
     share = np.concatenate([np.ones(LARGEST), 1 / (chance[drawn] * DRAWN)])
@@ -97,10 +96,10 @@ def relative_error(
     color = np.asarray(colors(*found.shape[:2])).ravel()
     column = _total(
         *(jnp.asarray(a, jnp.float32) for a in (found.squares, (sums[left - 1] / left) ** 2)),
-        *(jnp.asarray(color), jnp.asarray(color[found.index])),
+        *(jnp.asarray(color), jnp.asarray(color[found.places])),
         jnp.asarray(received / scale, jnp.float32),
     )
-    total = (found.share * w2[found.index] * np.asarray(column, np.float64)).sum() * scale
+    total = (found.share * w2[found.places] * np.asarray(column, np.float64)).sum() * scale
     return float(np.sqrt(total * probes / found.gaussian))
 
 

@@ -10,6 +10,7 @@ nearer than about √K pixels and no more.
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +31,7 @@ COLORS = {"fireflies": "tab:red", "ordinary": "tab:blue"}
 
 
 @jax.jit
-def columns(f: jax.Array, x: jax.Array, index: jax.Array) -> tuple[jax.Array, jax.Array]:
+def columns(f: Any, x: jax.Array, index: jax.Array) -> tuple[jax.Array, jax.Array]:
     """f(x), and J e_j for each flat index."""
     value, tangent = jax.linearize(f, x)
 
