@@ -3,6 +3,7 @@
 import copy
 import functools
 import itertools
+import math
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +27,7 @@ from progden_jax.denoisers.graph import (
     Upsample,
 )
 from progden_jax.divergence import windows
+from progden_jax.divergence.exact import TIME_PER_PASS
 
 
 def blur(x):
@@ -294,6 +296,21 @@ def test_auto_takes_the_cheapest(real_frame):
     found = pd.divergence(blur, frame.color, one, method=pd.Exact(reach=(2, 1)))
     expected = dense_jacobian_diagonal(blur, frame.color)
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-5)
+
+
+def test_auto_takes_the_quicker_not_the_one_with_fewer_operations():
+    """Between as many colours as the cone has passes and 1.55 times that, colours are quicker."""
+    x = jnp.ones((48, 48, 3))
+    f = pd.denoisers.load("oidn-hdr-small").bind(pd.Frame(x, x))
+    cone = pd.Exact().cost(f, x)["cone"]
+    quicker = math.ceil(math.sqrt(cone / 3))
+    slower = math.ceil(math.sqrt(TIME_PER_PASS["cone"] * cone / 3))
+    assert quicker < slower
+    for period, expected in ((quicker, "coloring"), (slower - 1, "coloring"), (slower, "cone")):
+        method = pd.Exact(reach=(period - 1, 1))
+        assert method.cost(f, x)["coloring"] == 3 * period**2
+        assert method.time(f, x)["cone"] == TIME_PER_PASS["cone"] * cone
+        assert method.choose(f, x) == expected
 
 
 def test_windows_of_oidn_are_those_of_the_design():

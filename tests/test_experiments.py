@@ -62,7 +62,8 @@ def test_methods(monkeypatch, tmp_path, capsys):
     """On a corner of 16 pixels: probing is nearest, and a second run has nothing left to do."""
     csv_file = tmp_path / "found.csv"
     options = ["--data", str(DEMO), "--spp", "8", "--crop", "16", "--most", "1"]
-    command = ["methods", *options, "--denoisers", "oidn-hdr-small", "--output", str(csv_file)]
+    paths = ["--output", str(csv_file), "--kept", str(tmp_path / "exact")]
+    command = ["methods", *options, "--denoisers", "oidn-hdr-small", *paths]
     monkeypatch.setattr(sys, "argv", command)
     monkeypatch.setattr(methods.pd, "enable_compilation_cache", lambda: None)
     methods.main()

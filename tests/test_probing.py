@@ -10,7 +10,7 @@ from conftest import counting_compilations, dense_jacobian_diagonal, divergence
 
 import progden_jax as pd
 from progden_jax.divergence import _random, evaluate
-from progden_jax.divergence.probing import MOST_PROBES, SCALES, colors, walsh
+from progden_jax.divergence.probing import MOST_PROBES, SCALES, colors, deflated, walsh
 
 SIZE = (12, 14, 3)
 
@@ -29,17 +29,13 @@ def variance(x):
 def small(real_frame):
     """A 32×32 crop of a render with OIDN's small network, and the exact σ²·∂f/∂x."""
     crop = (slice(40, 72), slice(30, 62))
-    frame = pd.Frame(real_frame.color[crop], real_frame.variance[crop])
+    return with_truth(pd.Frame(real_frame.color[crop], real_frame.variance[crop]))
+
+
+def with_truth(frame):
     f = pd.denoisers.load("oidn-hdr-small").bind(frame)
-    _, tangent = jax.linearize(f, frame.color)
-    size = frame.color.size
-
-    def diagonal(i):
-        one = jnp.zeros(size).at[i].set(1).reshape(frame.color.shape)
-        return tangent(one).ravel()[i]
-
-    jacobian = jax.jit(lambda: jax.lax.map(diagonal, jnp.arange(size), batch_size=64))()
-    return f, frame, np.asarray(frame.variance) * np.asarray(jacobian).reshape(frame.color.shape)
+    truth = pd.divergence(f, frame.color, frame.variance, method=pd.Exact("cone"))
+    return f, frame, np.asarray(truth)
 
 
 def near(x):
@@ -105,7 +101,7 @@ def test_nested(x, variance):
     """K probes are the first K of one sequence, each with the same field of signs."""
     key = jax.random.key(3)
     sigma = np.sqrt(np.asarray(variance))
-    weight = sigma * (sigma + np.abs(np.asarray(near(x)))) ** 0.75
+    weight = sigma * (np.abs(np.asarray(near(x))) + sigma / 10)
     signs = np.asarray(_random.signs(key, 0, x))
     contributions = []
     for k in range(11):
@@ -138,7 +134,7 @@ def test_variance_is_the_closed_form(x, variance):
     n = x.size
     jacobian = np.asarray(jax.jacfwd(near)(x)).reshape(n, n)
     value, sigma2 = np.asarray(near(x)).ravel(), np.asarray(variance).ravel()
-    weight = np.sqrt(sigma2) * (np.sqrt(sigma2) + np.abs(value)) ** 0.75
+    weight = np.sqrt(sigma2) * (np.abs(value) + np.sqrt(sigma2) / 10)
     color = colors(*SIZE[:2])
     keys = jax.random.split(jax.random.key(5), 2000)
     for count in (2, 5, 8):
@@ -156,6 +152,67 @@ def test_variance_is_the_closed_form(x, variance):
         measured = np.asarray(found, np.float64).reshape(len(keys), n).var(0, ddof=1)
         np.testing.assert_allclose(measured.sum(), expected.sum(), rtol=0.1)
         np.testing.assert_allclose(measured, expected, rtol=0.5, atol=1e-4 * expected.max())
+
+
+@pytest.fixture
+def loud(variance):
+    """The variance with three values that hold nearly all of it, and which these are."""
+    where = np.zeros(SIZE, bool)
+    where[4, 5, 0] = where[4, 5, 2] = where[10, 2, 1] = True
+    return jnp.where(where, 1e4 * variance, variance), where
+
+
+def test_outliers_get_probes_of_their_own(x, loud):
+    variance, where = loud
+    for probes, expected in ((3, 0), (16, 3)):
+        index, number = deflated(variance, probes)
+        assert len(index) == probes // 4
+        assert number == expected
+    assert set(np.asarray(deflated(variance, 16)[0][:3])) == set(np.flatnonzero(where))
+    found = pd.divergence(near, x, variance, method=pd.Probing(probes=16))
+    truth = np.asarray(variance) * dense_jacobian_diagonal(near, np.asarray(x))
+    np.testing.assert_allclose(found[where], truth[where], rtol=1e-5)
+    quiet = jnp.where(where, 0, variance)
+    alone = pd.divergence(near, x, quiet, method=pd.Probing(probes=13))
+    np.testing.assert_allclose(found[~where], alone[~where], rtol=1e-4, atol=1e-7)
+
+
+def test_without_outliers_no_probe_is_spent_on_one_value(variance):
+    for each in (variance, jnp.zeros_like(variance), jnp.ones_like(variance)):
+        assert deflated(each, 64)[1] == 0
+
+
+def test_unbiased_beside_outliers(x, loud):
+    variance, where = loud
+    truth = np.asarray(variance) * dense_jacobian_diagonal(near, np.asarray(x))
+    keys = jax.random.split(jax.random.key(4), 600)
+    method = pd.Probing(probes=12)
+    run = jax.jit(jax.vmap(lambda key: pd.divergence(near, x, variance, method=method, key=key)))
+    found = np.asarray(run(keys), np.float64)
+    error = found.std(0, ddof=1) / np.sqrt(len(keys))
+    assert (np.abs(found.mean(0) - truth) < 5 * error + 1e-5 * np.abs(truth)).all()
+    assert (error[where] < 1e-6 * np.abs(truth[where])).all()
+
+
+@pytest.mark.parametrize("probes", [4, 16])
+def test_a_firefly_does_not_drown_the_other_pixels(probes, small):
+    """σ = 1e6 in one pixel: the relative error elsewhere is at most three times that without it."""
+    _, frame, _ = small
+    color, wild = (
+        jnp.asarray(a).at[17, 13].set(v) for a, v in ((frame.color, 1e6), (frame.variance, 1e12))
+    )
+    elsewhere = np.ones((32, 32), bool)
+    elsewhere[17, 13] = False
+    errors = []
+    for f, each, truth in (small, with_truth(pd.Frame(color, wild))):
+        run = jax.jit(
+            lambda key, f=f, each=each: pd.divergence(
+                f, each.color, each.variance, method=pd.Probing(probes=probes), key=key
+            )
+        )
+        found = [run(key)[elsewhere] for key in jax.random.split(jax.random.key(9), 5)]
+        errors.append(np.median([relative_rmse(d, truth[elsewhere]) for d in found]))
+    assert errors[1] < 3 * errors[0]
 
 
 def relative_rmse(found, truth):

@@ -11,8 +11,9 @@ its CSV lacks.
 import argparse
 import csv
 import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,13 +23,16 @@ import progden_jax as pd
 from experiments import _common
 from experiments.divergence import _figures
 from progden_jax import _windows
-from progden_jax.divergence import evaluate
+from progden_jax.compilation import cache_folder
+from progden_jax.divergence import Evaluation, evaluate
+from progden_jax.divergence.running import ExactRun
 from progden_jax.training.evaluation import oracle_alpha
 
 HERE = Path(__file__).parent
 WINDOW = 15
 """Of the closed form, in pixels; SURE maps are compared after averaging over it, too."""
 
+NAMES = ("exact", "differences", "rademacher", "probing")
 HEADER = (
     *("denoiser", "scene", "spp", "method", "probes", "passes", "seconds"),
     *("error", "mean_error", "sure", "sure_exact", "sure_window", "sure_window_exact"),
@@ -78,40 +82,64 @@ def rms(value: Any) -> float:
     return float(np.sqrt(np.square(np.asarray(value, np.float64)).mean()))
 
 
+class Frame(NamedTuple):
+    """One frame as every method gets it, and where it came from."""
+
+    label: tuple[str, str, int]
+    frame: pd.Frame
+    reference: jax.Array
+    f: Any
+
+
+def exact(case: Frame, folder: Path) -> tuple[Evaluation, float]:
+    """The exact divergence and its seconds, nan where a checkpoint in `folder` had some of it."""
+    frame = case.frame
+    assert frame.variance is not None
+    run = ExactRun(case.f, frame.color, frame.variance, method=pd.Exact("cone"))
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{run.key}.npz"
+    start = float("nan") if path.exists() else time.perf_counter()
+    found = jax.block_until_ready(run.finish(checkpoint=path))
+    return found, time.perf_counter() - start
+
+
 def measure(
-    frame: pd.Frame, reference: jax.Array, denoiser: pd.Denoiser, most: int, key: jax.Array
-) -> list[tuple]:
-    """The columns from "method" on, for every method."""
-    frame, _ = pd.repair(frame)
-    f, x, variance = denoiser.bind(frame), frame.color, frame.variance
+    case: Frame, wanted: set[tuple[str, int]], most: int, folder: Path, warm: set
+) -> Iterator[tuple]:
+    """The columns from "method" on, for the methods wanted; `warm` has those that are compiled."""
+    frame, f = case.frame, case.f
+    x, variance = frame.color, frame.variance
     assert variance is not None
-    truth, right, rows = np.zeros(()), {}, []
+    key = jax.random.key(1)
+    found, seconds = exact(case, folder)
+    truth = np.asarray(found.divergence, np.float64)
+    right = consequences(frame, case.reference, found.value, found.divergence)
     for name, count, method in methods(most):
-        evaluate(f, x, variance, method=method, key=key) if name != "exact" else None
-        start = time.perf_counter()
-        found = jax.block_until_ready(evaluate(f, x, variance, method=method, key=key))
-        seconds = time.perf_counter() - start
+        if (name, count) not in wanted:
+            continue
+        if name != "exact":
+            if (name, count, case.label[0]) not in warm:
+                jax.block_until_ready(evaluate(f, x, variance, method=method, key=key))
+                warm.add((name, count, case.label[0]))
+            start = time.perf_counter()
+            found = jax.block_until_ready(evaluate(f, x, variance, method=method, key=key))
+            seconds = time.perf_counter() - start
         estimate = np.asarray(found.divergence, np.float64)
-        seen = consequences(frame, reference, found.value, found.divergence)
-        if name == "exact":
-            truth, right = estimate, seen
-        rows.append(
-            (
-                *(name, count, passes(name, count, f, x), seconds),
-                rms(estimate - truth) / rms(truth),
-                abs(estimate.mean() - truth.mean()) / abs(truth.mean()),
-                rms(seen["sure"] - right["sure"]),
-                rms(right["sure"] - right["truth"]),
-                rms(seen["sure_window"] - right["sure_window"]),
-                rms(right["sure_window"] - right["truth_window"]),
-                rms(seen["alpha"] - right["alpha"]),
-                rms(right["alpha"] - right["oracle"]),
-                float(seen["rmse"] / right["rmse"]),
-                float(seen["smape"] / right["smape"]),
-                rms(seen["image"] - right["image"]) / float(right["rmse"]),
-            )
+        seen = consequences(frame, case.reference, found.value, found.divergence)
+        yield (
+            *(name, count, passes(name, count, f, x), seconds),
+            rms(estimate - truth) / rms(truth),
+            abs(estimate.mean() - truth.mean()) / abs(truth.mean()),
+            rms(seen["sure"] - right["sure"]),
+            rms(right["sure"] - right["truth"]),
+            rms(seen["sure_window"] - right["sure_window"]),
+            rms(right["sure_window"] - right["truth_window"]),
+            rms(seen["alpha"] - right["alpha"]),
+            rms(right["alpha"] - right["oracle"]),
+            float(seen["rmse"] / right["rmse"]),
+            float(seen["smape"] / right["smape"]),
+            rms(seen["image"] - right["image"]) / float(right["rmse"]),
         )
-    return rows
 
 
 def main() -> None:
@@ -121,28 +149,36 @@ def main() -> None:
     parser.add_argument("--denoisers", nargs="*", default=("oidn-hdr", "oidn-hdr-alb-nrm"))
     parser.add_argument("--most", type=int, default=256, help="most probes of a method compared")
     parser.add_argument("--crop", type=int, default=128, help="side of the frames' corner taken")
+    parser.add_argument("--methods", nargs="*", choices=NAMES, default=NAMES)
+    parser.add_argument("--again", nargs="*", choices=NAMES, default=(), help="forget their rows")
     parser.add_argument("--output", type=Path, default=HERE / "methods.csv")
+    parser.add_argument("--kept", type=Path, default=cache_folder() / "exact")
     arguments = parser.parse_args()
     pd.enable_compilation_cache()
     names = _common.scenes(arguments.data, arguments.scenes)
     rows: list[dict[str, str]] = []
     if arguments.output.exists():
         with arguments.output.open() as file:
-            rows = list(csv.DictReader(file))
-    done = {(r["denoiser"], r["scene"], int(r["spp"])) for r in rows}
+            rows = [row for row in csv.DictReader(file) if row["method"] not in arguments.again]
+    done = {tuple(map(str, (row[name] for name in HEADER[:5]))) for row in rows}
+    every = [(m, k) for m, k, _ in methods(arguments.most) if m in arguments.methods]
+    warm: set = set()
     for which in arguments.denoisers:
         denoiser = pd.denoisers.load(which)
         for scene, spp, frame, reference in _common.series(arguments.data, names, arguments.spp):
-            if (which, scene, spp) in done:
+            wanted = {(m, k) for m, k in every if (which, scene, str(spp), m, str(k)) not in done}
+            if not wanted:
                 continue
             n = arguments.crop
             frame, truth = jax.tree.map(
                 lambda a, n=n: a[:n, :n] if a.ndim else a, (frame, reference.color)
             )
-            for row in measure(frame, truth, denoiser, arguments.most, jax.random.key(1)):
-                cells = (which, scene, spp, *row)
+            frame, _ = pd.repair(frame)
+            case = Frame((which, scene, spp), frame, truth, denoiser.bind(frame))
+            for row in measure(case, wanted, arguments.most, arguments.kept, warm):
+                cells = (*case.label, *row)
                 rows.append(dict(zip(HEADER, map(str, cells), strict=True)))
-            _figures.save(arguments.output, HEADER, rows)
+                _figures.save(arguments.output, HEADER, rows)
             print(which, scene, spp, flush=True)
     table = f"{_common.machine()}\n\n{_figures.table(rows)}\n"
     arguments.output.with_suffix(".md").write_text(table)

@@ -21,6 +21,12 @@ _CHANNEL_STEPS = (0, 775, 526)
 
 SCALES = ("radiance", "sigma", "unit")
 
+_REACH_LIMIT = 30
+"""Times the geometric mean of |f| + σ/10: what lies above and is mostly noise counts for less."""
+
+_WORTH_A_PROBE = 0.7
+"""Outliers get probes of their own where the error of the rest is expected to fall to this share or less."""
+
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +41,9 @@ class Probing:
     The variance per pixel is (σ_i²/w_i)² Σ_{j≠i} (J_ij w_j c_ij)², c_ij the mean of h_k(i) h_k(j). Cost:
     one denoiser pass and one tangent pass per probe.
 
+    Where few values hold most of the variance, as fireflies do, up to a quarter of the probes are unit
+    vectors of these (deflation): they come out exact, and the others no longer see them; see `deflated`.
+
     Parameters
     ----------
     probes : number K of tangent passes, 1 to 1024, best a power of two; by default 16, or with a tolerance
@@ -45,10 +54,12 @@ class Probing:
         tile has stopped. Under ``vmap`` all probes are computed, though the result is the same.
     replicates : independent fields of signs that the probes are shared between. With one, the
         default, the error is least and its size unknown (standard error inf); with R ≥ 2 the error is
-        larger (by about √R) and its size known from their spread. A tolerance needs at least 2, its default.
-    scale : "radiance" takes w = σ (σ + |f(x)|)^¾: a denoiser that works on the logarithm of radiance responds
-        less to a pixel the brighter it is, so dark ones would pollute bright ones. "sigma" takes w = σ,
-        better for filters linear in radiance; "unit" takes w = 1.
+        larger (by about √R) and its size known from their spread; no probe is then spent on a single value.
+        A tolerance needs at least 2, its default.
+    scale : "radiance" takes w = σ (|f(x)| + σ/10): a denoiser that works on the logarithm of radiance
+        responds less to a pixel the brighter it is, so dark ones would pollute bright ones. Above 30 times
+        its geometric mean |f| + σ/10 is reduced, unless |f| > σ, so that no firefly drowns the rest. "sigma"
+        takes w = σ, better for filters linear in radiance; "unit" takes w = 1.
     tile : edge of a tile in pixels.
     chunk : probes in flight at once; memory grows with it.
 
@@ -59,7 +70,8 @@ class Probing:
 
     Notes
     -----
-    Stathopoulos, Laeuchli, Orginos 2013. Lattice and exponent were fitted on training renders with OIDN's
+    Stathopoulos, Laeuchli, Orginos 2013; deflation after Gambhir, Stathopoulos, Orginos 2017, of single
+    values instead of singular vectors. Lattice and weight were fitted on training renders with OIDN's
     network: experiments/divergence.
     """
 
@@ -112,15 +124,15 @@ class Probing:
         key: jax.Array,
     ) -> Evaluation:
         value, tangent = jax.linearize(f, x)
-        weight, gain = _weight_and_gain(safe_sqrt(variance), value, self.scale)
+        weight, gain = weight_and_gain(safe_sqrt(variance), value, self.scale)
         pixel_colors = colors(*x.shape[:2])
+        probes, replicates = self._counts
+        each = probes // replicates
 
         def sample(probe: Array, replicate: Array) -> Array:
             pattern = _random.signs(key, replicate, x) * walsh(probe, pixel_colors).astype(x.dtype)
             return gain * pattern * tangent(weight * pattern)
 
-        probes, replicates = self._counts
-        each = probes // replicates
         if self.tolerance is not None:
             return _adaptive.evaluate(
                 sample,
@@ -132,7 +144,25 @@ class Probing:
                 tile=self.tile,
                 chunk=self.chunk,
             )
-        return Evaluation(value, *_replicated(sample, each, replicates, self.chunk, value))
+        outliers, number = deflated(variance, probes)
+        if replicates > 1 or not len(outliers):
+            return Evaluation(value, *_replicated(sample, each, replicates, self.chunk, value))
+
+        place = jnp.arange(x.size).reshape(x.shape)
+        taken = jnp.where(jnp.arange(len(outliers)) < number, outliers, x.size)
+        apart = jnp.zeros(x.size, bool).at[taken].set(True, mode="drop").reshape(x.shape)
+        weight, gain = jnp.where(apart, 0, weight), jnp.where(apart, 0, gain)
+        shared = probes - number
+
+        def either(probe: Array) -> Array:
+            structured = probe < shared
+            pattern = _random.signs(key, 0, x) * walsh(probe, pixel_colors).astype(x.dtype)
+            unit = (place == outliers[jnp.clip(probe - shared, 0)]).astype(x.dtype)
+            found = tangent(jnp.where(structured, weight * pattern, unit))
+            share = probes / shared.astype(x.dtype)
+            return found * jnp.where(structured, share * gain * pattern, probes * variance * unit)
+
+        return Evaluation(value, *accumulate(either, probes, self.chunk, value))
 
 
 def _replicated(
@@ -142,6 +172,28 @@ def _replicated(
         return accumulate(lambda probe: sample(probe, replicate), each, chunk, like)[0]
 
     return accumulate(mean, replicates, 1, like)
+
+
+def deflated(
+    variance: Float[Array, "h w 3"], probes: int
+) -> tuple[Int[Array, " most"], Int[Array, ""]]:
+    """Flat indices of the largest variances, a quarter as many as probes, and how many get a probe each.
+
+    With M of them out of the way and K − M probes for the rest, the error of these falls to about
+    (1 − c)/(1 − M/K) where they hold the share c of the variance: M makes that least, and is 0 where it would
+    stay above 0.7. (What reaches far depends on Σ σ² alone; structured probes fall as 1/K.)
+    """
+    most = probes // 4
+    # The barrier keeps XLA from sorting a constant variance while it compiles, which takes minutes.
+    values = lax.optimization_barrier(lax.stop_gradient(variance).ravel())
+    top, index = lax.top_k(values, min(most, values.size))
+    total = values.sum()
+    held = jnp.concatenate([jnp.zeros(1, top.dtype), jnp.cumsum(top)])
+    # Below what sums in float32 can tell, fewer are as good.
+    left = jnp.maximum(1 - held / jnp.where(total > 0, total, 1), 1e-5)
+    error = left / (1 - jnp.arange(len(held)) / probes)
+    number = jnp.argmin(error)
+    return index, jnp.where(error[number] <= _WORTH_A_PROBE, number, 0)
 
 
 def colors(height: int, width: int) -> Int[Array, "h w 3"]:
@@ -162,13 +214,17 @@ def walsh(probe: Array | int, color: Int[Array, "h w 3"]) -> Int[Array, "h w 3"]
     return 1 - 2 * (lax.population_count(shared) & 1)
 
 
-def _weight_and_gain(sigma: Array, value: Array, scale: str) -> tuple[Array, Array]:
+def weight_and_gain(sigma: Array, value: Array, scale: str) -> tuple[Array, Array]:
     """w, and σ²/w; formed apart so that nothing under- or overflows between 1e-6 and 1e6."""
     if scale == "unit":
         return jnp.ones_like(sigma), sigma**2
     if scale == "sigma":
         return sigma, sigma
-    reach = sigma + jnp.abs(value)
     seen = sigma > 0
-    factor = jnp.where(seen, jnp.where(seen, reach, 1) ** 0.75, 1)
-    return sigma * factor, sigma / factor
+    signal, noise = jnp.abs(value), jnp.where(seen, sigma, 1)
+    reach = jnp.where(seen, signal + noise / 10, 1)
+    mean = jnp.exp(jnp.where(seen, jnp.log(reach), 0).sum() / jnp.maximum(seen.sum(), 1))
+    # Bright surfaces are no outliers: 128 samples show them with |f| far above σ.
+    level = _REACH_LIMIT * mean * jnp.clip(signal / noise, 1, 1e3) ** 2
+    reach = reach * jnp.minimum(level / reach, 1) ** 1.5
+    return jnp.where(seen, sigma * reach, 0), jnp.where(seen, sigma / reach, 0)

@@ -47,7 +47,7 @@ def exact_divergence(
     Parameters
     ----------
     f, x, variance : as for `divergence`.
-    method : the algorithm; by default the cheapest.
+    method : the algorithm; by default the quickest.
     progress : called as ``progress(done, total)`` before the first step and after each, in units of its own
         (pixels or colours). What it raises ends the run, the checkpoint being kept.
     checkpoint : a file for what is found, written every ten seconds and when an exception, such as that of
