@@ -162,7 +162,9 @@ class Probing:
             share = probes / shared.astype(x.dtype)
             return found * jnp.where(structured, share * gain * pattern, probes * variance * unit)
 
-        return Evaluation(value, *accumulate(either, probes, self.chunk, value))
+        # Probes of one field of signs are no independent samples: their spread is not their mean's error.
+        found, _ = accumulate(either, probes, self.chunk, value)
+        return Evaluation(value, found, jnp.full_like(value, jnp.inf))
 
 
 def _replicated(
