@@ -8,6 +8,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Array, Float
+from matplotlib.axes import Axes
 
 import progden_jax as pd
 from experiments import _common
@@ -172,3 +173,26 @@ def summary(errors: Errors, shown: Sequence[str]) -> str:
         )
         parts.append(_common.markdown(header, lines))
     return "\n\n".join(parts)
+
+
+COLORS = {
+    "render": "tab:blue",
+    "denoised": "tab:orange",
+    "closed form": "tab:purple",
+    "mix": "tab:green",
+    "oracle": "gray",
+}
+
+
+def plot_over_spp(axis: Axes, errors: Errors, images: Sequence[str], label: str) -> None:
+    """Means over scenes, log-log."""
+    spps: list[int] = []
+    for name in images:
+        means = by_spp(errors, name, label)
+        spps = list(means)
+        style = ":" if name == "oracle" else "o-"
+        axis.plot(spps, list(means.values()), style, color=COLORS[name], ms=4, label=name)
+    axis.set(xscale="log", yscale="log", xlabel="samples per pixel", ylabel=label)
+    axis.set_xticks(spps, labels=[str(s) for s in spps])
+    axis.minorticks_off()
+    axis.grid(alpha=0.3)

@@ -5,16 +5,11 @@ python -m experiments.table4.train --data ../shared/data/train --output runs/tab
 Each run is a folder of its own. The same command goes on where it was killed and skips what is done.
 """
 
-import argparse
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import progden_jax as pd
-from progden_jax.training import MixerConfig, MixerTask, config, train
-from progden_jax.training.evaluation import Scores
-
-TRAIN = Path(__file__).resolve().parents[3] / "shared" / "data" / "train"
+from experiments import _training
 
 
 class Run(NamedTuple):
@@ -28,7 +23,7 @@ BUDGETS: dict[str, tuple[str, dict[str, Any]]] = {
     "paper": ("cpu", {"steps": 600, "batch": 12, "crop": 64, "peak_rate": 1e-3, "ema": 0.99}),
     "multiscale": ("multiscale", {"steps": 300, "crop": 64, "draws": 1}),
 }
-"""The configuration that runs begin from, and its budget; `evaluate_every` is a third of the steps."""
+"""The configuration that runs begin from, and its budget."""
 
 RUNS = {
     "paper": Run("paper's network, whole"),
@@ -45,49 +40,17 @@ RUNS = {
 """Folder -> run; the name up to the hyphen is the whole method."""
 
 
-def configuration(
-    name: str, data: tuple[str, ...], changes: Mapping[str, Any] | None = None
-) -> MixerConfig:
-    """Of that run."""
-    base, budget = BUDGETS[name.partition("-")[0]]
-    fields = {**budget, **RUNS[name].changes, "data": data, **(changes or {})}
-    for every in ("evaluate_every", "checkpoint_every"):
-        fields.setdefault(every, max(1, fields["steps"] // 3))
-    return config.load(MixerConfig, base, fields)
-
-
-class Lines:
-    """A line per evaluation, see `progden_jax.training.Report`."""
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-
-    def started(self, step: int, steps: int) -> None:
-        print(f"{self.name}: step {step} of {steps}", flush=True)
-
-    def stepped(self, step: int, values: dict[str, float] | None) -> None:
-        pass
-
-    def evaluated(self, step: int, scores: Scores, *, best: bool) -> None:
-        print(f"{self.name}: step {step}, score {scores.score:.4f}{' (best)' * best}", flush=True)
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--data", default=str(TRAIN), help="folder of NAME_SSSSSSspp.exr files")
-    parser.add_argument("--output", type=Path, required=True, help="folder of the runs")
+    parser = _training.parser(__doc__)
     parser.add_argument("--only", nargs="*", choices=RUNS, default=list(RUNS), metavar="RUN")
-    parser.add_argument(
-        "--set", nargs="*", default=(), metavar="FIELD=VALUE", help="over every configuration's"
-    )
     arguments = parser.parse_args()
     pd.enable_compilation_cache()
-    changes = dict(config.parse_change(text, MixerConfig) for text in arguments.set)
+    runs = {}
     for name in arguments.only:
-        task = MixerTask(configuration(name, (arguments.data,), changes))
-        train(task, arguments.output / name, report=Lines(name))
+        base, budget = BUDGETS[name.partition("-")[0]]
+        fields = {**budget, **RUNS[name].changes, "data": [str(arguments.data)]}
+        runs[name] = _training.configuration(base, fields | _training.changes(arguments.set))
+    _training.train_all(runs, arguments.output)
 
 
 if __name__ == "__main__":
