@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 from matplotlib.axes import Axes
+from matplotlib.ticker import LogLocator
 
 import progden_jax as pd
 from experiments import _common
@@ -195,4 +196,6 @@ def plot_over_spp(axis: Axes, errors: Errors, images: Sequence[str], label: str)
     axis.set(xscale="log", yscale="log", xlabel="samples per pixel", ylabel=label)
     axis.set_xticks(spps, labels=[str(s) for s in spps])
     axis.minorticks_off()
+    axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.yaxis.set_major_formatter("{x:g}")
     axis.grid(alpha=0.3)

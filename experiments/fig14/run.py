@@ -19,6 +19,9 @@ from progden_jax import mixers
 from progden_jax.sheet import Row, save_sheet
 
 HERE = Path(__file__).parent
+SHEET = (32, 512)
+"""Samples per pixel of the rows of the sheet, and the most there are."""
+
 IMAGES = ("render", "denoised", "closed form", "mix", "oracle")
 
 
@@ -59,7 +62,9 @@ def main() -> None:
     for _, spp, frame, _ in series:
         seen = _mixes.look(_mixes.lean(frame), denoiser, jax.random.key(0))
         z, alpha = _mixes.mix(seen, mixer)
-        rows.append(Row(f"{spp} spp", *(np.asarray(a) for a in (seen.x, seen.y, z, alpha))))
+        if spp in SHEET or spp == series[-1][1]:
+            images = (np.asarray(a) for a in (seen.x, seen.y, z, alpha))
+            rows.append(Row(f"{spp} spp", *images))
         for name in IMAGES:
             share = float(alpha.mean()) if name == "mix" else ""
             shown.append((spp, name, *errors[scene, spp, name].values(), share))

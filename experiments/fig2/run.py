@@ -109,10 +109,8 @@ def plot(lines: list[tuple], path: Path) -> None:
             own = [x for x in lines if (x[1], x[3]) == (scene, image)]
             spp, mse, estimate = np.asarray([(x[2], *x[4:]) for x in own]).T
             axis.plot(spp, np.sqrt(np.maximum(mse, 0)), "o-", color=color, ms=3, label=image)
-            shown = estimate > 0
-            axis.plot(
-                spp[shown], np.sqrt(estimate[shown]), "x--", color=color, label=f"{image}, estimate"
-            )
+            shown = np.sqrt(np.where(estimate > 0, estimate, np.nan))
+            axis.plot(spp, shown, "x--", color=color, label=f"{image}, estimate")
         axis.set(xscale="log", yscale="log", title=scene)
         spps = sorted({x[2] for x in lines})
         axis.set_xticks(spps, labels=[str(n) for n in spps])
@@ -123,7 +121,7 @@ def plot(lines: list[tuple], path: Path) -> None:
     figure.supxlabel("samples per pixel")
     figure.supylabel("RMSE")
     handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=6, fontsize=8)
+    figure.legend(handles, labels, loc="outside upper center", ncols=6, fontsize=8)
     _common.save_figure(path, figure)
 
 

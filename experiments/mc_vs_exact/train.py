@@ -15,7 +15,7 @@ from experiments.mc_vs_exact import _crops
 from progden_jax.training.index import index
 
 DENOISER = "oidn-hdr-small"
-SPP = (8, 32, 128, 512)
+SPP = (8, 128)
 BUDGET: dict[str, Any] = {"steps": 300, "denoiser": DENOISER, "spp": SPP}
 
 METHODS: dict[str, dict[str, Any]] = {
