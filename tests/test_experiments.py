@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
+import jax
 import pytest
 from conftest import DEMO
 
@@ -25,6 +26,7 @@ from experiments.table2 import run as table2
 from experiments.table3 import run as table3
 from experiments.table4 import run as table4
 from experiments.table4 import train as table4_train
+from progden_jax import denoisers
 
 Command = Callable[..., str]
 
@@ -40,6 +42,15 @@ def command(monkeypatch, capsys) -> Command:
         return capsys.readouterr().out
 
     return run
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory) -> Path:
+    """Weights of a denoiser that compiles at once: hardly more than a mean over 3×3 pixels."""
+    path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
+    options = {"layers": 1, "width": 4, "layer_size": 3, "kernel_size": 3}
+    denoisers.save(path, denoisers.KPCN.init(jax.random.key(0), **options))
+    return path
 
 
 def cells(printed: str, *begin: str) -> list[list[str]]:
@@ -133,25 +144,25 @@ def test_table3(command):
     assert all(float(row[i]) < 1 for row in oracle for i in (1, 2))
 
 
-def test_tables_1_and_2(command, tmp_path):
+def test_tables_1_and_2(command, tiny):
     """A denoiser that is not there is skipped by name; one without a mixer gets the closed form."""
-    words = ("--denoisers", "unet-nowhere", "oidn-hdr-small")
+    words = ("--denoisers", "unet-nowhere", tiny)
     printed = command(table1, *DEMO_OPTIONS, *words)
     assert "skipped unet-nowhere: neither a file nor one of oidn-hdr" in printed
-    (den,) = cells(printed, "oidn-hdr-small (ClosedForm(window=15, confidence=0.7))", "den")
+    (den,) = cells(printed, f"{tiny} (ClosedForm(window=15, confidence=0.7))", "den")
     mix, closed, oracle = (cells(printed, "", m)[0] for m in ("pro-den", "closed form", "oracle"))
     assert mix == ["", "pro-den", *closed[2:]]
     assert float(oracle[2]) < float(mix[2]) < float(den[2])
     assert den[5] == "0.0%"
     assert oracle[5] == "100.0%"
     with pytest.raises(SystemExit, match="no denoiser to measure"):
-        command(table2, *DEMO_OPTIONS, "--denoisers", tmp_path / "nowhere.safetensors")
+        command(table2, *DEMO_OPTIONS, "--denoisers", "nowhere.safetensors")
 
 
-def test_table4(command, tmp_path):
+def test_table4(command, tiny, tmp_path):
     """Two ablations trained for two steps; a second command finds them done; both are in the table."""
     data, runs = two_scenes(tmp_path), tmp_path / "runs"
-    few = ("steps=2", "batch=2", "crop=16", "denoiser=oidn-hdr-small")
+    few = ("steps=2", "batch=2", "crop=16", f"denoiser={tiny}", "exposure_stops=0.0")
     words = ("--data", data, "--output", runs, "--set", *few, "--only", "paper", "paper-ratio")
     printed = command(table4_train, *words)
     assert "paper-ratio: step 2, score" in printed
@@ -159,7 +170,7 @@ def test_table4(command, tmp_path):
         "paper: step 2 of 2",
         "paper-ratio: step 2 of 2",
     ]
-    words = ("--data", DEMO, "--spp", 32, "--denoiser", "oidn-hdr-small", "--runs", runs)
+    words = ("--data", DEMO, "--spp", 32, "--denoiser", tiny, "--runs", runs)
     printed = command(table4, *words)
     assert "no weights of paper-sure, paper-swap, multiscale" in printed
     assert cells(printed, "paper, without f_act")[0][1] in ("1 of 2", "2 of 2")
@@ -169,10 +180,10 @@ def test_table4(command, tmp_path):
     assert free[1] != bound[1]
 
 
-def test_fig2(command, tmp_path):
+def test_fig2(command, tiny, tmp_path):
     """The render's error is its variance, and SURE's estimate of the denoised image's is near."""
     output = tmp_path / "found.csv"
-    words = ("--denoisers", "oidn-hdr-small", "--probes", 1, "--output", output)
+    words = ("--denoisers", tiny, "--probes", 1, "--output", output)
     command(fig2, "--data", DEMO, "--spp", 128, *words)
     rows = {row["image"]: row for row in _common.read_csv(output)}
     assert set(rows) == {"render", "denoised", "mix", "mix, α held", "oracle"}
@@ -180,12 +191,12 @@ def test_fig2(command, tmp_path):
         truth, estimate = (float(rows[name][column]) for column in ("mse", "estimate"))
         assert abs(estimate / truth - 1) < tolerance
     assert float(rows["mix"]["mse"]) < float(rows["denoised"]["mse"])
-    assert (tmp_path / "found-oidn-hdr-small.png").stat().st_size > 10_000
+    assert (tmp_path / "found-tiny.png").stat().st_size > 10_000
 
 
-def test_fig10(command, tmp_path):
+def test_fig10(command, tiny, tmp_path):
     output = tmp_path / "found.csv"
-    words = ("--denoisers", "oidn-hdr-small", "--output", output)
+    words = ("--denoisers", tiny, "--output", output)
     printed = command(fig10, *DEMO_OPTIONS, *words)
     (render,) = cells(printed, "RMSE", "render")
     assert float(render[3]) < float(render[2])
@@ -193,13 +204,13 @@ def test_fig10(command, tmp_path):
     assert output.with_suffix(".png").stat().st_size > 10_000
 
 
-def test_fig12(command, tmp_path, monkeypatch):
+def test_fig12(command, tiny, tmp_path, monkeypatch):
     """Every window, with and without shift, gives another image."""
     monkeypatch.setattr(fig12, "WINDOWS", (3, 11))
     bounds = [fig12.Bound(window, shift) for shift in (True, False) for window in (3, 11)]
     monkeypatch.setattr(fig12, "BOUNDS", bounds)
     output = tmp_path / "found.csv"
-    words = ("--denoiser", "oidn-hdr-small", "--mixer", "closed-form", "--output", output)
+    words = ("--denoiser", tiny, "--mixer", "closed-form", "--output", output)
     printed = command(fig12, "--data", DEMO, "--spp", 32, *words)
     assert len(cells(printed, "11×11, no shift")) == 3
     found = {row["image"]: row["RMSE"] for row in _common.read_csv(output)}
@@ -208,9 +219,9 @@ def test_fig12(command, tmp_path, monkeypatch):
         assert (tmp_path / name).stat().st_size > 10_000
 
 
-def test_fig14(command, tmp_path):
+def test_fig14(command, tiny, tmp_path):
     output = tmp_path / "found.csv"
-    words = ("--denoiser", "oidn-hdr-small", "--output", output)
+    words = ("--denoiser", tiny, "--output", output)
     printed = command(fig14, *DEMO_OPTIONS, *words)
     assert cells(printed, "proc2004") != []
     assert 0 < float(cells(printed, "8", "mix")[0][5]) < 1
@@ -219,12 +230,12 @@ def test_fig14(command, tmp_path):
         assert (tmp_path / name).stat().st_size > 10_000
 
 
-def test_mc_vs_exact(command, tmp_path, monkeypatch):
+def test_mc_vs_exact(command, tiny, tmp_path, monkeypatch):
     """On crops of 16 pixels: probes change the image a little, and a second run has nothing to do."""
     output, runs = tmp_path / "found.csv", tmp_path / "runs"
     data = two_scenes(tmp_path)
     monkeypatch.setenv("PROGDEN_CACHE", str(tmp_path / "cache"))
-    few = ("steps=1", "batch=2", "spp=[8]", "options={ width = 4 }")
+    few = ("steps=1", "batch=2", "spp=[8]", f"denoiser={tiny}", "exposure_stops=0.0")
     words = ("--data", data, "--output", runs, "--crop", 16, "--seeds", 0, "--set", *few)
     monkeypatch.setattr(
         mc_vs_exact_train,
@@ -233,6 +244,7 @@ def test_mc_vs_exact(command, tmp_path, monkeypatch):
     )
     command(mc_vs_exact_train, *words)
     words = ("--data", data, "--runs", runs, "--crop", 16, "--scenes", 1, "--spp", 8)
+    words += ("--denoiser", tiny)
     printed = command(mc_vs_exact, *words, "--output", output)
     rows = _common.read_csv(output)
     assert {row["mixer"] for row in rows} == {

@@ -143,7 +143,7 @@ def main() -> None:
         lines = measure(which, mixer, names, arguments)
         every += lines
         _common.write_csv(arguments.output, HEADER, every)
-        picture = arguments.output.with_name(f"{arguments.output.stem}-{which}.png")
+        picture = arguments.output.with_name(f"{arguments.output.stem}-{Path(which).stem}.png")
         plot(lines, picture)
         print(f"## {which}\n\n{table(lines)}\n", flush=True)
 
