@@ -17,7 +17,7 @@ import numpy as np
 import progden_jax as pd
 from experiments import _common, _mixes, _training
 from experiments.mc_vs_exact import _crops
-from experiments.mc_vs_exact.train import DENOISER, runs
+from experiments.mc_vs_exact.train import CROP, DENOISER, SPP, runs
 from progden_jax import mixers
 from progden_jax.training.estimates import EstimateCache
 
@@ -125,8 +125,10 @@ def main() -> None:
     parser.add_argument("--denoiser", help=f"by default oidn-hdr, of runs {DENOISER}")
     parser.add_argument("--runs", type=Path, help="folder that experiments.mc_vs_exact.train wrote")
     parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1], help="of the runs")
-    parser.add_argument("--spp", type=int, nargs="*", default=(8, 32, 128, 512))
-    parser.add_argument("--crop", type=int, default=64, help="side of the crops, a multiple of 16")
+    parser.add_argument("--spp", type=int, nargs="*", default=SPP)
+    parser.add_argument(
+        "--crop", type=int, default=CROP, help="side of the crops, a multiple of 16"
+    )
     parser.add_argument("--output", type=Path, default=HERE / "inference.csv")
     arguments = parser.parse_args()
     pd.enable_compilation_cache()

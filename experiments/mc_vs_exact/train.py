@@ -16,6 +16,9 @@ from progden_jax.training.index import index
 
 DENOISER = "oidn-hdr-small"
 SPP = (8, 128)
+CROP = 48
+"""Side in pixels."""
+
 BUDGET: dict[str, Any] = {"steps": 300, "denoiser": DENOISER, "spp": SPP}
 
 METHODS: dict[str, dict[str, Any]] = {
@@ -47,7 +50,9 @@ def crop_all(data: Path, folder: Path, size: int, spp: tuple[int, ...]) -> None:
 
 def main() -> None:
     parser = _training.parser(__doc__)
-    parser.add_argument("--crop", type=int, default=48, help="side of the crops, a multiple of 16")
+    parser.add_argument(
+        "--crop", type=int, default=CROP, help="side of the crops, a multiple of 16"
+    )
     parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1])
     arguments = parser.parse_args()
     pd.enable_compilation_cache()
