@@ -234,22 +234,17 @@ def test_mc_vs_exact(command, tiny, tmp_path, monkeypatch):
     output, runs = tmp_path / "found.csv", tmp_path / "runs"
     data = two_scenes(tmp_path)
     monkeypatch.setenv("PROGDEN_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(mc_vs_exact_train, "METHODS", {"exact": mc_vs_exact_train.METHODS["exact"]})
+    compared = {name: (mc_vs_exact.INFERENCE[name][0], 1) for name in ("exact", "1 probe")}
+    monkeypatch.setattr(mc_vs_exact, "INFERENCE", compared)
     few = ("steps=1", "batch=2", "spp=[8]", f"denoiser={tiny}", "exposure_stops=0.0")
-    words = ("--data", data, "--output", runs, "--crop", 16, "--seeds", 0, "--set", *few)
-    monkeypatch.setattr(
-        mc_vs_exact_train,
-        "METHODS",
-        {name: mc_vs_exact_train.METHODS[name] for name in ("exact", "probes-1")},
-    )
-    command(mc_vs_exact_train, *words)
+    words = ("--data", data, "--output", runs, "--crop", 16, "--seeds", 0)
+    command(mc_vs_exact_train, *words, "--set", *few, "options={ width = 4, blocks = 1 }")
     words = ("--data", data, "--runs", runs, "--crop", 16, "--scenes", 1, "--spp", 8)
     words += ("--denoiser", tiny)
     printed = command(mc_vs_exact, *words, "--output", output)
     rows = _common.read_csv(output)
-    assert {row["mixer"] for row in rows} == {
-        *("denoised", "oracle"),
-        *("exact-seed-0", "probes-1-seed-0"),
-    }
+    assert [row["mixer"] for row in rows] == ["denoised", "oracle", "exact-seed-0", "exact-seed-0"]
     for row in rows:
         assert (float(row["image"]) > 0) == (row["method"] != "exact")
     assert cells(printed, "exact", "1 probe") != []
