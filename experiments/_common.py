@@ -1,15 +1,19 @@
 """What the experiments share: the data, the machine they ran on, tables."""
 
 import argparse
+import csv
 import os
 import platform
 from collections.abc import Iterable, Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import jax
+from matplotlib.figure import Figure
 
 import progden_jax as pd
+from progden_jax._files import replacing
 
 VALID = Path(__file__).resolve().parents[2] / "shared" / "data" / "valid"
 SPP = (2, 8, 32, 128, 512)
@@ -72,3 +76,25 @@ def markdown(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
         cells = [f"{cell:.4g}" if isinstance(cell, float) else str(cell) for cell in row]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
+
+
+def read_csv(path: Path) -> list[dict[str, str]]:
+    """The rows; none where there is no file."""
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """All rows, whole or not at all."""
+    with replacing(path) as temporary, temporary.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(header)
+        writer.writerows(rows)
+
+
+def save_figure(path: Path, figure: Figure, **options: Any) -> None:
+    """As a PNG, whole or not at all."""
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=110, **options)

@@ -24,6 +24,7 @@ def t_bound(
     a: float = 2.0,
     c: float = 4.2,
     window: int = 11,
+    shift: bool = True,
     sigmoid: str = "normal",
     mean_variance: Float[Array, ""] | None = None,
     inside: Bool[Array, "h w 1"] | None = None,
@@ -36,6 +37,7 @@ def t_bound(
     x, y, variance : (H, W, 3) noisy and denoised image, and the variance of `x`.
     a, c : steepness and position of the sigmoid on |t|.
     window : odd width of the neighbourhood, in pixels.
+    shift : False leaves out the window's pixel of highest variance, which else weighs most.
     sigmoid : "normal", the standard normal's distribution function, or "logistic".
     mean_variance : over the whole image, where x is only a tile of it; by default that of `variance`.
     inside : (H, W, 1) False where the arrays are padding around the image.
@@ -61,10 +63,10 @@ def t_bound(
         _checks.same_shape(name, value, "x", x)
     _checks.odd_int("window", window)
     _checks.choice("sigmoid", sigmoid, _SIGMOIDS)
-    return _t_bound(alpha, x, y, variance, a, c, mean_variance, inside, window, sigmoid)
+    return _t_bound(alpha, x, y, variance, a, c, mean_variance, inside, window, shift, sigmoid)
 
 
-@functools.partial(jax.jit, static_argnames=("window", "sigmoid"))
+@functools.partial(jax.jit, static_argnames=("window", "shift", "sigmoid"))
 def _t_bound(
     alpha: Array,
     x: Array,
@@ -75,6 +77,7 @@ def _t_bound(
     mean_variance: Array | None,
     inside: Array | None,
     window: int,
+    shift: bool,
     sigmoid: str,
 ) -> Array:
     difference = alpha * (y - x)
@@ -86,13 +89,14 @@ def _t_bound(
     height = 1 / (scale * math.sqrt(2 * math.pi))
 
     # Zero outside for the sums, and out of reach for the maximum.
-    candidates = variance if inside is None else jnp.where(inside, variance, -jnp.inf)
-    highest, difference_there = _windows.argmax_payload(candidates, difference, window)
-    if inside is not None:
-        highest = jnp.where(inside, highest, 0)
     numerator = height * _windows.gaussian_sum(difference.sum(-1), window, 0.5 / scale**2)
-    numerator = numerator + difference_there.sum(-1) / 3
     noise = height**2 * _windows.gaussian_sum(variance.sum(-1), window, 1 / scale**2)
-    noise = noise + highest.sum(-1) / 9
+    if shift:
+        candidates = variance if inside is None else jnp.where(inside, variance, -jnp.inf)
+        highest, difference_there = _windows.argmax_payload(candidates, difference, window)
+        if inside is not None:
+            highest = jnp.where(inside, highest, 0)
+        numerator = numerator + difference_there.sum(-1) / 3
+        noise = noise + highest.sum(-1) / 9
     t = jnp.abs(numerator) / (safe_sqrt(noise) + 1e-6)
     return alpha * _SIGMOIDS[sigmoid](-a * (t - c))[..., None]

@@ -10,6 +10,7 @@ import progden_jax as pd
 from progden_jax import mixers, pipeline
 from progden_jax._convolution import same_convolution
 from progden_jax.cli import main
+from progden_jax.mixers import multiscale
 from progden_jax.mixing import f_act
 
 
@@ -187,6 +188,44 @@ def test_multiscale_starts_as_the_closed_form(images):
         gradients, alpha = run(params, nothing, nothing, zero, zero)
         assert all(np.isfinite(g).all() for g in jax.tree.leaves(gradients))
         np.testing.assert_array_equal(alpha, 0)
+
+
+def test_multiscale_ablations(images, tmp_path):
+    """Each group hidden changes α, none the weights' shapes; without its start α begins at one half."""
+    known = (images.x, images.y, images.variance, images.divergence, images.divergence)
+    whole = mixers.build("multiscale", {"width": 3, "blocks": 1})
+    rng = np.random.default_rng(3)
+    params = jax.tree.map(
+        lambda p: np.float32(p + 0.3 * rng.normal(size=p.shape)), whole.init(jax.random.key(0))
+    )
+    run = jax.jit(lambda mixer: mixer(*known))
+    alpha = run(pd.NetworkMixer(params, whole))
+    hidden = {}
+    for group in multiscale.GROUPS:
+        # As a configuration has it, and a weights file.
+        settings = {"width": 3, "blocks": 1, "without": [group]}
+        path = tmp_path / f"{group}.safetensors"
+        mixers.save_mixer(path, pd.NetworkMixer(params, mixers.build("multiscale", settings)))
+        loaded = pd.load_mixer(path)
+        assert loaded.architecture.without == (group,)
+        assert np.abs(run(loaded) - alpha).max() > 0.01
+        hidden[group], closed, _ = jax.jit(
+            lambda *k, group=group: multiscale.features(*k, without=(group,))
+        )(*known[:4])
+    shown, expected, _ = jax.jit(multiscale.features)(*known[:4])
+    np.testing.assert_array_equal(closed, expected)
+    zeros = {group: int((value == 0).all((0, 1)).sum()) for group, value in hidden.items()}
+    assert shown.shape[-1] == multiscale.CHANNELS
+    assert not (shown == 0).all((0, 1)).any()
+    assert zeros == {"scales": 21, "divergence": 9, "relative": 15}
+
+    bare = mixers.build("multiscale", {"width": 3, "blocks": 1, "start": "none"})
+    start = np.asarray(run(pd.NetworkMixer(bare.init(jax.random.key(0)), bare)))
+    assert set(np.unique(start)) <= {0.0, 0.5}
+    with pytest.raises(ValueError, match="without is 'colour', expected one of 'scales'"):
+        mixers.build("multiscale", {"without": ["colour"]})
+    with pytest.raises(ValueError, match="start is 'half', expected one of 'closed-form', 'none'"):
+        mixers.build("multiscale", {"start": "half"})
 
 
 @pytest.mark.parametrize("channels", [3, 40])

@@ -14,7 +14,7 @@ import progden_jax as pd
 from progden_jax import _windows
 
 
-def dense_t_bound(alpha, x, y, variance, a=2.0, c=4.2, window=11, sigmoid="normal"):
+def dense_t_bound(alpha, x, y, variance, a=2.0, c=4.2, window=11, shift=True, sigmoid="normal"):
     """Pixel by pixel, in float64, as the definition reads."""
     alpha, x, y, variance = (np.asarray(v, np.float64) for v in (alpha, x, y, variance))
     height, width, _ = x.shape
@@ -37,8 +37,9 @@ def dense_t_bound(alpha, x, y, variance, a=2.0, c=4.2, window=11, sigmoid="norma
                         noise += kappa**2 * variance[k, m, channel]
                         if variance[k, m, channel] > best:
                             best, best_d = variance[k, m, channel], d[k, m, channel]
-                numerator += best_d / 3
-                noise += best / 9
+                if shift:
+                    numerator += best_d / 3
+                    noise += best / 9
             t = abs(numerator) / (math.sqrt(max(noise, 0)) + 1e-6)
             S = ndtr if sigmoid == "normal" else expit
             result[i, j] = alpha[i, j] * (1 - S(a * (t - c)))
@@ -46,7 +47,15 @@ def dense_t_bound(alpha, x, y, variance, a=2.0, c=4.2, window=11, sigmoid="norma
 
 
 @pytest.mark.parametrize(
-    "settings", [{}, {"sigmoid": "logistic"}, {"window": 3, "a": 1.0, "c": 2.0}, {"window": 1}]
+    "settings",
+    [
+        {},
+        {"sigmoid": "logistic"},
+        {"window": 3, "a": 1.0, "c": 2.0},
+        {"window": 1},
+        {"shift": False},
+        {"shift": False, "window": 5},
+    ],
 )
 @pytest.mark.parametrize("scale", [1e-6, 1e-3, 0.1, 10.0])
 def test_against_the_definition(images, scale, settings):
@@ -89,14 +98,15 @@ def test_box_sums(window):
     )
 
 
-def test_padding_outside_counts_as_outside(images):
+@pytest.mark.parametrize("shift", [True, False])
+def test_padding_outside_counts_as_outside(images, shift):
     alpha = np.full_like(images.x, 0.8)
-    expected = pd.t_bound(alpha, images.x, images.y, images.variance)
+    expected = pd.t_bound(alpha, images.x, images.y, images.variance, shift=shift)
     pad = [(0, 6), (0, 5), (0, 0)]
     inside = np.pad(np.ones((13, 18, 1), bool), pad)
     padded = [np.pad(v, pad) for v in (alpha, images.x, images.y, images.variance)]
     np.testing.assert_allclose(
-        pd.t_bound(*padded, inside=inside)[:13, :18], expected, rtol=1e-5, atol=1e-7
+        pd.t_bound(*padded, inside=inside, shift=shift)[:13, :18], expected, rtol=1e-5, atol=1e-7
     )
 
 

@@ -18,6 +18,9 @@ WINDOWS = (3, 7, 15, 31)
 CHANNELS = 54
 """Of `features`."""
 
+GROUPS = ("scales", "divergence", "relative")
+"""Of features that an ablation can leave out, see `Multiscale`."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Multiscale:
@@ -31,14 +34,24 @@ class Multiscale:
     ----------
     width : channels of the hidden layers.
     blocks : residual blocks of two 3×3 convolutions.
+    without : groups of features that are hidden from the network, for ablations: "scales", the statistics of
+        windows other than 15×15; "divergence", every f'; "relative", what is relative to the surroundings.
+    start : "closed-form", or "none" for α = sigmoid(network) (an ablation).
     """
 
     width: int = 32
     blocks: int = 2
+    without: tuple[str, ...] = ()
+    start: str = "closed-form"
 
     def __post_init__(self) -> None:
         _checks.positive_int("width", self.width)
         _checks.positive_int("blocks", self.blocks)
+        # Configurations and weights files have lists.
+        object.__setattr__(self, "without", tuple(self.without))
+        for group in self.without:
+            _checks.choice("without", group, GROUPS)
+        _checks.choice("start", self.start, ("closed-form", "none"))
 
     def init(self, key: jax.Array) -> Params:
         """Weights that give the closed form: the last layer is zero."""
@@ -59,15 +72,18 @@ class Multiscale:
         del sure
 
         def prepared(*images: Array) -> tuple[Array, Array, Array]:
-            return features(*images, inside=inside)
+            return features(*images, inside=inside, without=self.without)
 
         for _ in range(x.ndim - 3):
             prepared = jax.vmap(prepared)
         stacked, closed, noisy = prepared(x, y, variance, divergence)
         correction = self._net.apply({"params": params}, stacked, inside)
         assert isinstance(correction, jax.Array)
-        kept = jnp.clip(closed, 0.01, 0.99)
-        alpha = nn.sigmoid(jnp.log(kept / (1 - kept)) + correction)
+        if self.start == "none":
+            alpha = nn.sigmoid(correction)
+        else:
+            kept = jnp.clip(closed, 0.01, 0.99)
+            alpha = nn.sigmoid(jnp.log(kept / (1 - kept)) + correction)
         return jnp.where(noisy, alpha, 0)
 
     @property
@@ -107,6 +123,7 @@ def features(
     divergence: Float[Array, "h w 3"],
     *,
     inside: Bool[Array, "h w 1"] | None = None,
+    without: tuple[str, ...] = (),
 ) -> tuple[Float[Array, "h w f"], Float[Array, "h w 3"], Bool[Array, "h w 3"]]:
     """What the network sees, the closed form over 15×15 windows, and where such a window has variance.
 
@@ -119,6 +136,7 @@ def features(
     ----------
     x, y, variance, divergence : (H, W, 3), see `progden_jax.sure`.
     inside : (H, W, 1) False where they are padding around the image.
+    without : `GROUPS` of features to give as zeros.
     """
     counted = jnp.ones_like(x[..., :1]) if inside is None else inside.astype(x.dtype)
 
@@ -140,21 +158,27 @@ def features(
     away = {1: squared, **{w: mean(squared, w) for w in WINDOWS}}
     noise = {1: variance, **{w: mean(variance, w) for w in WINDOWS}}
 
-    found, closed = [], x
+    found: list[Array] = []
+
+    def show(feature: Array, *groups: str) -> None:
+        found.append(jnp.zeros_like(feature) if set(groups) & set(without) else feature)
+
+    closed = x
     for w in WINDOWS:
+        scales = () if w == 15 else ("scales",)
         alpha = jnp.clip(mean(useful, w) / (away[w] + least), 0, 1)
         closed = alpha if w == 15 else closed
-        found += [alpha, 0.3 * jnp.log((away[w] + least) / (noise[w] + least))]
+        show(alpha, *scales)
+        show(0.3 * jnp.log((away[w] + least) / (noise[w] + least)), *scales)
         if w in (3, 15):
-            found.append(jnp.clip(mean(divergence, w) / (noise[w] + least), -1, 2))
-    found += [
-        0.2 * jnp.log((squared + least) / (variance + least)),
-        jnp.clip(divergence / (variance + least), -1, 2),
-        jnp.clip(useful / (squared + least), -1, 2),
-        0.2 * jnp.log((noise[15] + least) / brightness**2),
-        0.2 * jnp.log((variance + least) / (noise[15] + least)),
-        0.5 * jnp.log(jnp.maximum(y, 0) / brightness + 0.01),
-        0.5 * jnp.clip((x - y) / jnp.sqrt(away[7] + least), -3, 3),
-        0.5 * jnp.clip((x - y) / jnp.sqrt(noise[7] + least), -3, 3),
-    ]
+            slope = jnp.clip(mean(divergence, w) / (noise[w] + least), -1, 2)
+            show(slope, "divergence", *scales)
+    show(0.2 * jnp.log((squared + least) / (variance + least)))
+    show(jnp.clip(divergence / (variance + least), -1, 2), "divergence")
+    show(jnp.clip(useful / (squared + least), -1, 2))
+    show(0.2 * jnp.log((noise[15] + least) / brightness**2), "relative")
+    show(0.2 * jnp.log((variance + least) / (noise[15] + least)), "relative")
+    show(0.5 * jnp.log(jnp.maximum(y, 0) / brightness + 0.01), "relative")
+    show(0.5 * jnp.clip((x - y) / jnp.sqrt(away[7] + least), -3, 3), "relative")
+    show(0.5 * jnp.clip((x - y) / jnp.sqrt(noise[7] + least), -3, 3), "relative")
     return jnp.concatenate(found, -1), closed, noise[15] > 0
