@@ -20,6 +20,7 @@ from experiments.fig14 import run as fig14
 from experiments.main_job import run as main_job
 from experiments.mc_vs_exact import run as mc_vs_exact
 from experiments.mc_vs_exact import train as mc_vs_exact_train
+from experiments.performance import step
 from experiments.stability import run as stability
 from experiments.table1 import run as table1
 from experiments.table2 import run as table2
@@ -251,3 +252,16 @@ def test_mc_vs_exact(command, tiny, tmp_path, monkeypatch):
     assert cells(printed, "exact", "1 probe") != []
     assert command(mc_vs_exact, *words, "--output", output) == printed
     assert _common.read_csv(output) == rows
+
+
+def test_step(command, tmp_path):
+    """Of a batch of two 16×16: 54→32 1×1, then four 32→32 and one 32→3 3×3; all but the first thrice."""
+    net = mixers.build("multiscale")
+    first, rest = 54 * 32, 9 * 32 * (4 * 32 + 3)
+    found = step.operations(jax.jit(net.init)(jax.random.key(0)), 512)
+    assert found == 2 * 512 * (2 * first + 3 * rest)
+    words = ("--data", two_scenes(tmp_path), "--scenes", 2, "--architectures", "multiscale")
+    printed = command(step, *words, "--batch", 2, "--crop", 16, "--repeats", 1, "--channels", 8)
+    (row,) = cells(printed, "multiscale")
+    assert row[1] == f"{found / 1e9:.1f}"
+    assert float(row[5]) > 0

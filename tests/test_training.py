@@ -676,11 +676,13 @@ def test_training_a_denoiser(folder, tmp_path):
     """A small KPCN learns from renders without references, and its weights load as a denoiser."""
     changes = {"data": [str(folder)], "crop": 16, "held_out_scenes": ["two"], "loss": "sure"}
     changes |= {"steps": 20, "evaluate_every": 20, "peak_rate": 0.01, "inputs": ["variance"]}
+    changes["weights_dtype"] = "float16"
     chosen = config.load(DenoiserConfig, "smoke", changes)
     outcome = train(DenoiserTask(chosen), tmp_path)
     loaded = pd.denoisers.load(outcome.weights)
     assert loaded.inputs == ("variance",)
-    jax.tree.map(np.testing.assert_array_equal, loaded.params, outcome.state.best.params)
+    halves = jax.tree.map(lambda a: np.asarray(a, np.float16), outcome.state.best.params)
+    jax.tree.map(np.testing.assert_array_equal, loaded.params, halves)
     lines = [json.loads(line) for line in (tmp_path / "curves.jsonl").read_text().splitlines()]
     last = lines[-2]
     assert lines[-1]["denoised/rmse/4spp"] < lines[-1]["render/rmse/4spp"]
@@ -695,6 +697,7 @@ def test_denoiser_configurations(folder):
         ({"architecture": "vit"}, "architecture is 'vit', expected one of 'unet', 'kpcn'"),
         ({"options": {"depth": 2}}, "options is {'depth': 2}: .*depth"),
         ({"inputs": ["albedo"]}, "has no albedo, which this denoiser takes"),
+        ({"weights_dtype": "bfloat16"}, "weights_dtype is 'bfloat16', expected one of 'float32'"),
     ):
         values = {"data": [str(folder)], "crop": 16, **changes}
         with pytest.raises(ValueError, match=message):

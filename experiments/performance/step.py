@@ -2,8 +2,8 @@
 
 python -m experiments.performance.step [--architectures paper multiscale]
 
-Batch 12 of 128×128. The operations are three times the forward pass's multiply-adds (forward, kernels,
-inputs; the first layer needs no inputs'), two each. In one run, in turn, the least of many times.
+By default batch 12 of 128×128. The operations are three times the forward pass's multiply-adds (forward,
+kernels, inputs; the first layer needs no inputs'), two each. In one run, in turn, the least of many times.
 """
 
 import argparse
@@ -28,9 +28,8 @@ TRAIN = _common.VALID.parent / "train"
 
 def operations(params: Any, pixels: int) -> float:
     """Of the convolutions with these weights, forward and backward over so many pixels."""
-    layers = [layer["kernel"] for layer in params.values()]
-    products = [float(np.prod(kernel.shape)) * pixels for kernel in layers]
-    return 2 * (3 * sum(products) - products[0])
+    products = {name: float(np.prod(layer["kernel"].shape)) for name, layer in params.items()}
+    return 2 * pixels * (3 * sum(products.values()) - products["conv_in"])
 
 
 def convolution(batch: int, size: int, channels: int) -> tuple[Any, tuple[Any, ...], float]:
@@ -47,14 +46,16 @@ def convolution(batch: int, size: int, channels: int) -> tuple[Any, tuple[Any, .
     return run, (image, kernel), 2.0 * image.size * 9 * channels
 
 
-def task_on_some(data: Path, architecture: str, scenes: int, folder: Path) -> MixerTask:
+def task_on_some(
+    data: Path, architecture: str, scenes: int, folder: Path, *, batch: int, crop: int
+) -> MixerTask:
     """Training on a few scenes: a step takes as long on any number of them."""
     for name in _common.scenes(data, scenes):
         for path in data.glob(f"{name}_*spp.exr"):
             link = folder / path.name
             if not link.exists():
                 link.symlink_to(path.resolve())
-    values: dict[str, Any] = {"data": [str(folder)], "crop": 128, "batch": 12}
+    values: dict[str, Any] = {"data": [str(folder)], "crop": crop, "batch": batch}
     values |= {"architecture": architecture, "denoiser": "oidn-hdr-small"}
     if architecture == "multiscale":
         values |= {"loss": "log-errors", "swap": 0.0}
@@ -79,6 +80,8 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=TRAIN, help="folder of training renders")
     parser.add_argument("--scenes", type=int, default=3, help="how many of its scenes to load")
     parser.add_argument("--architectures", nargs="*", default=tuple(mixers.ARCHITECTURES))
+    parser.add_argument("--batch", type=int, default=12)
+    parser.add_argument("--crop", type=int, default=128)
     parser.add_argument("--repeats", type=int, default=10)
     parser.add_argument("--channels", type=int, default=96, help="of the convolution compared with")
     arguments = parser.parse_args()
@@ -88,7 +91,14 @@ def main() -> None:
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         for architecture in arguments.architectures:
-            task = task_on_some(arguments.data, architecture, arguments.scenes, Path(folder))
+            task = task_on_some(
+                arguments.data,
+                architecture,
+                arguments.scenes,
+                Path(folder),
+                batch=arguments.batch,
+                crop=arguments.crop,
+            )
             state, step = make_start(task)(jax.random.key(0)), make_step(task, None)
             arrays = jax.device_put(dict(task.arrays))
             chosen = jnp.arange(task.config.batch) % len(task.items)

@@ -99,10 +99,12 @@ class DenoiserConfig(RunConfig):
     inputs: tuple[str, ...] = ()  # buffers besides the colour, of albedo, normal and variance
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # as size of a unet
     probes: int = 1  # loss sure: of the divergence, drawn anew each step
+    weights_dtype: str = "float32"  # of the weights file; float16 halves it, to three digits
 
     def __post_init__(self) -> None:
         super().__post_init__()
         _checks.positive_int("probes", self.probes)
+        _checks.choice("weights_dtype", self.weights_dtype, ("float32", "float16"))
         for role in self.inputs:
             _checks.choice("inputs", role, ("albedo", "normal", "variance"))
 

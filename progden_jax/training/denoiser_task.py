@@ -95,7 +95,7 @@ class DenoiserTask:
 
     def export(self, path: os.PathLike[str], params: Any, metadata: Mapping[str, str]) -> None:
         """Write weights that `denoisers.load` takes."""
-        files.save(path, params, dtype="float32", metadata=metadata)
+        files.save(path, params, dtype=self.config.weights_dtype, metadata=metadata)
 
 
 def _frame(example: Mapping[str, Array]) -> Frame:
