@@ -1,0 +1,64 @@
+"""The weights that come with the package: small, with their origin, giving what they gave when recorded."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import progden_jax as pd
+from progden_jax import _safetensors, mixers
+from progden_jax.denoisers import files
+
+FILES = {path.stem: path for path in files.FOLDER.glob("*.safetensors")}
+RECORDED: dict[str, list[float]] = {
+    "kpcn-hdr-alb-nrm-var": [0.0613193, 0.0309585, 0.0516322, 0.111086, 0.0454345, 0.0920812],
+    "mixer-kpcn-hdr-alb-nrm-var": [0.806405, 0.729846, 0.773302, 0.97302, 0.586443, 0.790449],
+    "mixer-oidn-hdr": [0.895476, 0.832945, 0.884234, 0.987992, 0.712064, 0.913414],
+    "mixer-oidn-hdr-alb-nrm": [0.881646, 0.821827, 0.8716, 0.879978, 0.134119, 0.49366],
+    "mixer-unet-hdr": [0.739653, 0.603126, 0.712924, 0.731417, 0.222536, 0.483584],
+    "unet-hdr": [0.0606872, 0.0305358, 0.0520162, 0.10864, 0.0451267, 0.0947322],
+}
+"""Means of red, green and blue, then one pixel: of a denoised crop, or of a mixer's α on it."""
+
+
+@pytest.fixture(scope="module")
+def crop(real_frame):
+    return jax.tree.map(lambda a: a[40:72, 30:62], real_frame.replace(spp=None))
+
+
+def output(name: str, frame: pd.Frame) -> jax.Array:
+    if not name.startswith("mixer-"):
+        run = jax.jit(lambda denoiser, frame: denoiser.bind(frame)(frame.color))
+        return run(pd.denoisers.load(name), frame)
+    x, variance = frame.color, frame.variance
+    y = sum(jnp.roll(x, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)) / 9
+    divergence = variance / 9
+    risk = pd.sure(x, y, variance, divergence)
+    mixer = pd.load_mixer(name.removeprefix("mixer-"))
+    return jax.jit(lambda mixer, *images: mixer(*images))(mixer, x, y, variance, divergence, risk)
+
+
+def test_every_file_is_recorded_and_found_by_name():
+    assert set(FILES) == set(RECORDED)
+    named = {*files.shipped(), *(f"mixer-{n}" for n in mixers.names() if n != mixers.CLOSED_FORM)}
+    assert named == set(FILES)
+
+
+@pytest.mark.parametrize("name", sorted(FILES))
+def test_small_and_with_its_origin(name):
+    assert FILES[name].stat().st_size < 1_000_000
+    metadata = _safetensors.read(FILES[name])[1]
+    config = json.loads(metadata["config"])
+    assert config["data"]
+    assert isinstance(config["seed"], int)
+    assert 0 < int(metadata["steps"]) <= config["steps"]
+    assert len(metadata["commit"]) >= 7
+
+
+@pytest.mark.parametrize("name", sorted(FILES))
+def test_outputs_are_those_recorded(name, crop):
+    found = np.asarray(output(name, crop))
+    summary = [*found.mean((0, 1)), *found[9, 21]]
+    np.testing.assert_allclose(summary, RECORDED[name], rtol=1e-3, atol=1e-5)
