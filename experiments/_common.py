@@ -16,13 +16,16 @@ import progden_jax as pd
 from progden_jax._files import replacing
 
 VALID = Path(__file__).resolve().parents[2] / "shared" / "data" / "valid"
+TRAIN = VALID.with_name("train")
 SPP = (2, 8, 32, 128, 512)
 REFERENCE_SPP = 4096
 
 
 def parser(description: str | None) -> argparse.ArgumentParser:
     """A command line with --data and --scenes; modules add their own."""
-    made = argparse.ArgumentParser(description=description)
+    made = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     made.add_argument("--data", type=Path, default=VALID, help="folder of NAME_SSSSSSspp.exr files")
     made.add_argument("--scenes", type=int, default=None, help="only this many scenes")
     return made
@@ -38,6 +41,15 @@ def scenes(folder: Path, most: int | None = None) -> list[str]:
     return found[:most]
 
 
+def begin(arguments: argparse.Namespace, about: str = "") -> list[str]:
+    """Print where this runs and on what; the names of the scenes."""
+    pd.enable_compilation_cache()
+    print(machine())
+    names = scenes(arguments.data, arguments.scenes)
+    print(f"{len(names)} scenes of {arguments.data}{about and ', '}{about}\n")
+    return names
+
+
 def series(
     folder: Path, names: Iterable[str], spp: Sequence[int] = SPP
 ) -> Iterator[tuple[str, int, pd.Frame, pd.Frame]]:
@@ -48,6 +60,20 @@ def series(
             path = folder / f"{name}_{count:06}spp.exr"
             if path.exists():
                 yield name, count, pd.read_exr(path), reference
+
+
+def centre(frame: pd.Frame, size: int) -> pd.Frame:
+    """The middle size × size pixels of every buffer."""
+    if size > min(frame.size):
+        height, width = frame.size
+        raise ValueError(f"the crop is {size} pixels wide, the frame {width}×{height}.")
+    top, left = ((n - size) // 2 for n in frame.size)
+    changed = {
+        name: buffer[top : top + size, left : left + size]
+        for name in ("color", "variance", "albedo", "normal", "depth")
+        if (buffer := getattr(frame, name)) is not None
+    }
+    return frame.replace(**changed)
 
 
 def machine() -> str:
@@ -92,6 +118,12 @@ def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]
         writer = csv.writer(file)
         writer.writerow(header)
         writer.writerows(rows)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Whole or not at all."""
+    with replacing(path) as temporary:
+        temporary.write_text(text)
 
 
 def save_figure(path: Path, figure: Figure, **options: Any) -> None:

@@ -1,8 +1,10 @@
 """What the experiments on mixing share: the images, their errors, and shares of what an oracle could gain."""
 
+import argparse
 import functools
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -57,6 +59,15 @@ class Mix(NamedTuple):
 
     mixer: pd.Mixer
     bound: Bound | None = BOUND
+
+
+def parser(description: str | None, output: Path | None = None) -> argparse.ArgumentParser:
+    """That of `_common` with --spp, and --output where the errors go to a file."""
+    made = _common.parser(description)
+    made.add_argument("--spp", type=int, nargs="*", default=_common.SPP)
+    if output:
+        made.add_argument("--output", type=Path, default=output, help="pictures go beside it")
+    return made
 
 
 def lean(frame: pd.Frame) -> pd.Frame:

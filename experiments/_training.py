@@ -6,11 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import progden_jax as pd
-from progden_jax.training import MixerConfig, MixerTask, config, train
+from experiments import _common
+from progden_jax.training import MixerConfig, MixerTask, config, loop, train
 from progden_jax.training.evaluation import Scores
-
-TRAIN = Path(__file__).resolve().parents[2] / "shared" / "data" / "train"
-WEIGHTS = "weights.safetensors"
 
 
 def parser(description: str | None) -> argparse.ArgumentParser:
@@ -18,7 +16,7 @@ def parser(description: str | None) -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    made.add_argument("--data", type=Path, default=TRAIN, help="folder of NAME_SSSSSSspp.exr files")
+    made.add_argument("--data", type=Path, default=_common.TRAIN)
     made.add_argument("--output", type=Path, required=True, help="folder of the runs")
     made.add_argument(
         "--set", nargs="*", default=(), metavar="FIELD=VALUE", help="over every configuration's"
@@ -47,7 +45,7 @@ def train_all(runs: Mapping[str, MixerConfig], output: Path) -> None:
 
 def trained(runs: Path | None, names: Mapping[str, Any]) -> dict[str, pd.NetworkMixer]:
     """The weights of those runs in the folder that have some."""
-    files = {} if runs is None else {name: runs / name / WEIGHTS for name in names}
+    files = {} if runs is None else {name: runs / name / loop.WEIGHTS for name in names}
     found = {name: pd.load_mixer(file) for name, file in files.items() if file.exists()}
     return {name: mixer for name, mixer in found.items() if isinstance(mixer, pd.NetworkMixer)}
 

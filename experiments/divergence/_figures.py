@@ -1,6 +1,5 @@
 """The table and the plot of `methods`."""
 
-import csv
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,7 +8,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments import _common
-from progden_jax._files import replacing
 
 COLORS = {
     "differences": "tab:red",
@@ -21,14 +19,6 @@ TARGETS = {4: 0.38, 16: 0.20, 64: 0.12, 256: 0.06}
 """Of probing's error over that of differences."""
 
 Row = dict[str, str]
-
-
-def save(path: Path, header: Sequence[str], rows: Sequence[Row]) -> None:
-    """All rows, whole or not at all."""
-    with replacing(path) as temporary, temporary.open("w", newline="") as file:
-        writer = csv.DictWriter(file, header)
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def medians(rows: Sequence[Row]) -> dict[tuple[str, str, int], dict[str, float]]:
@@ -106,5 +96,4 @@ def pareto(rows: Sequence[Row], path: Path) -> None:
                 title=denoiser,
             )
             axis.legend()
-    with replacing(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=110)
+    _common.save_figure(path, figure)

@@ -15,7 +15,6 @@ import numpy as np
 
 import progden_jax as pd
 from experiments import _common
-from experiments.stability.run import crop
 
 FRAMES = (("proc2002", 8), ("proc2003", 128))
 METHODS: dict[str, pd.Method] = {
@@ -57,7 +56,7 @@ def main() -> None:
     rows = []
     for scene, spp in FRAMES:
         path = arguments.data / f"{scene}_{spp:06}spp.exr"
-        frame, _ = pd.repair(crop(pd.read_exr(path), arguments.size))
+        frame, _ = pd.repair(_common.centre(pd.read_exr(path), arguments.size))
         assert frame.variance is not None
         x, variance = jnp.asarray(frame.color), jnp.asarray(frame.variance)
         f = denoiser.bind(frame)
@@ -69,7 +68,8 @@ def main() -> None:
     header = ("scene", "spp", "method, K", "RMS z per pixel", "z of the mean", "error of the mean")
     table = _common.markdown(header, rows)
     note = f"{arguments.keys} keys, {arguments.denoiser}, {arguments.size}×{arguments.size}"
-    Path(__file__).with_suffix(".md").write_text(f"{_common.machine()}; {note}\n\n{table}\n")
+    text = f"{_common.machine()}; {note}\n\n{table}\n"
+    _common.write_text(Path(__file__).with_suffix(".md"), text)
 
 
 if __name__ == "__main__":

@@ -8,8 +8,6 @@ from those of the exact divergence, beside how far the latter are from the truth
 its CSV lacks.
 """
 
-import argparse
-import csv
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -144,7 +142,6 @@ def measure(
 
 def main() -> None:
     parser = _common.parser(__doc__)
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("--spp", type=int, nargs="*", default=(8, 128))
     parser.add_argument("--denoisers", nargs="*", default=("oidn-hdr", "oidn-hdr-alb-nrm"))
     parser.add_argument("--most", type=int, default=256, help="most probes of a method compared")
@@ -156,10 +153,8 @@ def main() -> None:
     arguments = parser.parse_args()
     pd.enable_compilation_cache()
     names = _common.scenes(arguments.data, arguments.scenes)
-    rows: list[dict[str, str]] = []
-    if arguments.output.exists():
-        with arguments.output.open() as file:
-            rows = [row for row in csv.DictReader(file) if row["method"] not in arguments.again]
+    kept = _common.read_csv(arguments.output)
+    rows = [row for row in kept if row["method"] not in arguments.again]
     done = {tuple(map(str, (row[name] for name in HEADER[:5]))) for row in rows}
     every = [(m, k) for m, k, _ in methods(arguments.most) if m in arguments.methods]
     warm: set = set()
@@ -178,10 +173,10 @@ def main() -> None:
             for row in measure(case, wanted, arguments.most, arguments.kept, warm):
                 cells = (*case.label, *row)
                 rows.append(dict(zip(HEADER, map(str, cells), strict=True)))
-                _figures.save(arguments.output, HEADER, rows)
+                _common.write_csv(arguments.output, HEADER, [tuple(r.values()) for r in rows])
             print(which, scene, spp, flush=True)
     table = f"{_common.machine()}\n\n{_figures.table(rows)}\n"
-    arguments.output.with_suffix(".md").write_text(table)
+    _common.write_text(arguments.output.with_suffix(".md"), table)
     _figures.pareto(rows, arguments.output.with_suffix(".png"))
     print(table)
 

@@ -19,7 +19,6 @@ import progden_jax as pd
 from experiments import _common
 from progden_jax.divergence.probing import colors
 
-TRAIN = _common.VALID.parent / "train"
 FRAMES = (("proc1003", 8), ("proc1011", 32), ("proc1020", 128), ("proc1030", 8))
 EXPONENTS = (0.0, 0.25, 0.5, 0.75, 1.0)
 RADIUS = 63
@@ -158,7 +157,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--data", type=Path, default=TRAIN)
+    parser.add_argument("--data", type=Path, default=_common.TRAIN)
     parser.add_argument("--rows", type=int, default=400, help="rows of the Jacobian per frame")
     parser.add_argument("--frames", type=int, default=len(FRAMES))
     arguments = parser.parse_args()

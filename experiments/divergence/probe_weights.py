@@ -20,7 +20,6 @@ from experiments import _common
 from experiments.divergence.spread import columns
 from progden_jax.divergence.probing import MOST_PROBES, colors, deflated, walsh, weight_and_gain
 
-TRAIN = _common.VALID.parent / "train"
 FRAMES = (
     *(("proc1000", 8), ("proc1003", 8), ("proc1009", 128), ("proc1018", 8), ("proc1020", 128)),
     *(("proc1024", 8), ("proc1027", 128), ("proc1030", 8), ("proc1033", 8), ("proc1036", 8)),
@@ -126,7 +125,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--data", type=Path, default=TRAIN)
+    parser.add_argument("--data", type=Path, default=_common.TRAIN)
     parser.add_argument("--frames", type=int, default=len(FRAMES))
     arguments = parser.parse_args()
     pd.enable_compilation_cache()

@@ -19,7 +19,6 @@ from matplotlib.figure import Figure
 
 import progden_jax as pd
 from experiments import _common
-from progden_jax._files import replacing
 from progden_jax._numeric import safe_sqrt
 from progden_jax.divergence.probing import weight_and_gain
 
@@ -113,15 +112,14 @@ def main() -> None:
         axis.set(xscale="log", yscale="log", xlabel="distance in pixels")
         axis.grid(alpha=0.3)
         axis.legend(fontsize=7)
-    with replacing(HERE / "spread.png") as temporary:
-        figure.savefig(temporary, format="png", dpi=110)
+    _common.save_figure(HERE / "spread.png", figure)
     header = (
         *("scene", "spp", "values"),
         *(f"from {a} px" for a in labels[1:]),
         *(f"Σ e beyond {a:.0f} px" for a in np.floor(EDGES[4:-1])),
     )
     text = f"{_common.machine()}\n\n{_common.markdown(header, table)}\n"
-    (HERE / "spread.md").write_text(text)
+    _common.write_text(HERE / "spread.md", text)
 
 
 if __name__ == "__main__":

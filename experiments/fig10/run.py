@@ -3,7 +3,6 @@
 python -m experiments.fig10.run
 """
 
-import argparse
 import itertools
 from pathlib import Path
 
@@ -43,16 +42,10 @@ def plot(found: dict[str, _mixes.Errors], path: Path) -> None:
 
 
 def main() -> None:
-    parser = _common.parser(__doc__)
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser = _mixes.parser(__doc__, HERE / "fig10.csv")
     parser.add_argument("--denoisers", nargs="*", default=("oidn-hdr", "oidn-hdr-alb-nrm"))
-    parser.add_argument("--spp", type=int, nargs="*", default=_common.SPP)
-    parser.add_argument("--output", type=Path, default=HERE / "fig10.csv")
     arguments = parser.parse_args()
-    pd.enable_compilation_cache()
-    print(_common.machine())
-    names = _common.scenes(arguments.data, arguments.scenes)
-    print(f"{len(names)} scenes of {arguments.data}\n")
+    names = _common.begin(arguments)
     found: dict[str, _mixes.Errors] = {}
     for which in arguments.denoisers:
         denoiser = pd.denoisers.load(which)

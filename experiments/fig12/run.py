@@ -3,7 +3,6 @@
 python -m experiments.fig12.run
 """
 
-import argparse
 from pathlib import Path
 
 import jax
@@ -83,17 +82,11 @@ def pictures(
 
 
 def main() -> None:
-    parser = _common.parser(__doc__)
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser = _mixes.parser(__doc__, HERE / "fig12.csv")
     parser.add_argument("--denoiser", default="oidn-hdr")
     parser.add_argument("--mixer", help="name or file; by default what is shipped for the denoiser")
-    parser.add_argument("--spp", type=int, nargs="*", default=_common.SPP)
-    parser.add_argument("--output", type=Path, default=HERE / "fig12.csv")
     arguments = parser.parse_args()
-    pd.enable_compilation_cache()
-    print(_common.machine())
-    names = _common.scenes(arguments.data, arguments.scenes)
-    print(f"{len(names)} scenes of {arguments.data}, {arguments.denoiser}\n")
+    names = _common.begin(arguments, arguments.denoiser)
     denoiser = pd.denoisers.load(arguments.denoiser)
     chosen = arguments.mixer
     mixer = mixers.load(chosen) if chosen else mixers.default_for(denoiser)

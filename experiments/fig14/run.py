@@ -5,7 +5,6 @@ python -m experiments.fig14.run
 The scene is the one with the largest variance of a pixel over the squared mean radiance of its image.
 """
 
-import argparse
 from pathlib import Path
 
 import jax
@@ -34,21 +33,15 @@ def extremity(frame: pd.Frame) -> float:
 
 
 def main() -> None:
-    parser = _common.parser(__doc__)
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser = _mixes.parser(__doc__, HERE / "fig14.csv")
     parser.add_argument("--denoiser", default="oidn-hdr")
-    parser.add_argument("--spp", type=int, nargs="*", default=_common.SPP)
     parser.add_argument("--at", type=int, default=32, help="spp that the scene is chosen at")
-    parser.add_argument("--output", type=Path, default=HERE / "fig14.csv")
     arguments = parser.parse_args()
-    pd.enable_compilation_cache()
-    print(_common.machine())
-    names = _common.scenes(arguments.data, arguments.scenes)
+    names = _common.begin(arguments, arguments.denoiser)
     found = {
         s: extremity(f) for s, _, f, _ in _common.series(arguments.data, names, [arguments.at])
     }
     ranking = sorted(found, key=lambda s: -found[s])
-    print(f"{len(names)} scenes of {arguments.data}, {arguments.denoiser}\n")
     header = ("scene", f"largest variance over squared mean, {arguments.at} spp")
     print(_common.markdown(header, [(s, found[s]) for s in ranking]))
     scene = ranking[0]

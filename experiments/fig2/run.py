@@ -126,17 +126,11 @@ def plot(lines: list[tuple], path: Path) -> None:
 
 
 def main() -> None:
-    parser = _common.parser(__doc__)
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser = _mixes.parser(__doc__, HERE / "fig2.csv")
     parser.add_argument("--denoisers", nargs="*", default=("oidn-hdr", "oidn-hdr-alb-nrm"))
-    parser.add_argument("--spp", type=int, nargs="*", default=_common.SPP)
     parser.add_argument("--probes", type=int, default=4, help="of the mix's derivative")
-    parser.add_argument("--output", type=Path, default=HERE / "fig2.csv")
     arguments = parser.parse_args()
-    pd.enable_compilation_cache()
-    print(_common.machine())
-    names = _common.scenes(arguments.data, arguments.scenes)
-    print(f"{len(names)} scenes of {arguments.data}\n")
+    names = _common.begin(arguments)
     every = []
     for which in arguments.denoisers:
         mixer = mixers.default_for(pd.denoisers.load(which))

@@ -3,7 +3,6 @@
 python -m experiments.main_job.run
 """
 
-import argparse
 from collections import defaultdict
 
 import jax
@@ -39,14 +38,10 @@ def firefly_share(variance: np.ndarray) -> float:
 
 def main() -> None:
     parser = _common.parser(__doc__)
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("--probes", type=int, default=1)
     arguments = parser.parse_args()
-    pd.enable_compilation_cache()
-    print(_common.machine())
-    names = _common.scenes(arguments.data, arguments.scenes)
     method = pd.MonteCarlo(probes=arguments.probes)
-    print(f"{len(names)} scenes of {arguments.data}, divergence by {method}\n")
+    names = _common.begin(arguments, f"divergence by {method}")
 
     for title, denoiser_name in DENOISERS.items():
         denoiser = pd.denoisers.load(denoiser_name)

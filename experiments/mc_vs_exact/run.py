@@ -6,7 +6,6 @@ python -m experiments.mc_vs_exact.run --runs RUNS --output trained.csv   # of wh
 Centre crops of every frame, the network run on the crop. Goes on with the frames that its CSV lacks.
 """
 
-import argparse
 from collections import defaultdict
 from pathlib import Path
 
@@ -16,7 +15,6 @@ import numpy as np
 
 import progden_jax as pd
 from experiments import _common, _mixes, _training
-from experiments.mc_vs_exact import _crops
 from experiments.mc_vs_exact.train import CROP, DENOISER, SPP, runs
 from progden_jax import mixers
 from progden_jax.training.estimates import EstimateCache
@@ -121,7 +119,6 @@ def table(rows: list[Row]) -> str:
 
 def main() -> None:
     parser = _common.parser(__doc__)
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("--denoiser", help=f"by default oidn-hdr, of runs {DENOISER}")
     parser.add_argument("--runs", type=Path, help="folder that experiments.mc_vs_exact.train wrote")
     parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1], help="of the runs")
@@ -151,7 +148,7 @@ def main() -> None:
         lacking = {n: m for n, m in chosen.items() if (*at, n, scene, str(spp)) not in done}
         if not lacking:
             continue
-        frame, truth = (_crops.centre(f, arguments.crop) for f in (frame, reference))
+        frame, truth = (_common.centre(f, arguments.crop) for f in (frame, reference))
         for mixer, *line in measure(frame, truth.color, caches, lacking):
             if (*at, mixer, scene, str(spp)) in done:
                 continue

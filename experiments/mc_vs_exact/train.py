@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import progden_jax as pd
-from experiments import _training
-from experiments.mc_vs_exact import _crops
+from experiments import _common, _training
 from progden_jax.training.index import index
 
 DENOISER = "oidn-hdr-small"
@@ -45,7 +44,7 @@ def crop_all(data: Path, folder: Path, size: int, spp: tuple[int, ...]) -> None:
         for path in (item.path, item.reference):
             target = folder / path.name
             if not target.exists():
-                pd.write_exr(target, _crops.centre(pd.read_exr(path), size))
+                pd.write_exr(target, _common.centre(pd.read_exr(path), size))
 
 
 def main() -> None:

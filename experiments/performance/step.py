@@ -23,7 +23,6 @@ from progden_jax.training import MixerConfig, MixerTask, config
 from progden_jax.training.step import make_start, make_step
 
 TARGET = 1.2
-TRAIN = _common.VALID.parent / "train"
 
 
 def operations(params: Any, pixels: int) -> float:
@@ -62,22 +61,20 @@ def task_on_some(
     return MixerTask(config.load(MixerConfig, "cpu", values), cache_folder=folder / "cache")
 
 
-def seconds(run: Any, repeats: int) -> list[float]:
-    """Of each call, the first left out, for it compiles."""
+def seconds(run: Any) -> float:
+    """Of one call."""
+    begin = time.perf_counter()
     jax.block_until_ready(run())
-    found = []
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        jax.block_until_ready(run())
-        found.append(time.perf_counter() - begin)
-    return found
+    return time.perf_counter() - begin
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--data", type=Path, default=TRAIN, help="folder of training renders")
+    parser.add_argument(
+        "--data", type=Path, default=_common.TRAIN, help="folder of training renders"
+    )
     parser.add_argument("--scenes", type=int, default=3, help="how many of its scenes to load")
     parser.add_argument("--architectures", nargs="*", default=tuple(mixers.ARCHITECTURES))
     parser.add_argument("--batch", type=int, default=12)
@@ -108,10 +105,9 @@ def main() -> None:
                 return step(copied, a, jax.random.key(0), c)
 
             peaks, times = [], []
-            seconds(once, 1)
-            for _ in range(arguments.repeats):
-                peaks += seconds(lambda: large(*images), 2)
-                times += seconds(once, 1)
+            for _ in range(1 + arguments.repeats):  # the first compiles
+                peaks.append(seconds(lambda: large(*images)))
+                times.append(seconds(once))
             speed = count / min(peaks)
             total = operations(state.params, task.config.batch * task.config.crop**2)
             limit = total / speed

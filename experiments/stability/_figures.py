@@ -105,7 +105,7 @@ def plot(header: Sequence[str], rows: Sequence[tuple], path: Path) -> None:
         axes.set_ylabel("relative RMSE of σ²f'")
         axes.grid(alpha=0.3)
         axes.legend(fontsize=7)
-    figure.savefig(path, dpi=110)
+    _common.save_figure(path, figure)
 
 
 def _line(

@@ -8,7 +8,6 @@ pixels that were tampered with. "total" is against the exact divergence in float
 were not tampered with, by unit vectors: there chance is included.
 """
 
-import argparse
 import csv
 import dataclasses
 from collections.abc import Iterator
@@ -49,14 +48,6 @@ class Case(NamedTuple):
     frame: pd.Frame
     f: Any
     untouched: np.ndarray
-
-
-def crop(frame: pd.Frame, size: int) -> pd.Frame:
-    """The middle of a frame: colour and variance."""
-    assert frame.variance is not None
-    top, left = ((n - size) // 2 for n in frame.size)
-    window = np.s_[top : top + size, left : left + size]
-    return pd.Frame(frame.color[window], frame.variance[window])
 
 
 def tampered(frame: pd.Frame, how: str) -> tuple[pd.Frame, np.ndarray]:
@@ -242,7 +233,6 @@ def measure(
 
 def main() -> None:
     parser = _common.parser(__doc__)
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("--spp", type=int, nargs="*", default=SPP)
     parser.add_argument("--size", type=int, default=48, help="edge of the crop in pixels")
     parser.add_argument("--denoiser", default="oidn-hdr")
@@ -261,7 +251,7 @@ def main() -> None:
         writer.writerow(HEADER)
         frames = _common.series(arguments.data, names, arguments.spp)
         for number, (scene, spp, frame, _) in enumerate(frames):
-            small = crop(frame, arguments.size)
+            small = _common.centre(pd.Frame(frame.color, frame.variance), arguments.size)
             for row in measure(
                 small,
                 arguments.denoiser,
@@ -279,7 +269,7 @@ def main() -> None:
             file.flush()
             print(scene, spp, len(rows), "rows", flush=True)
     table = f"{_common.machine()}\n\n{_figures.summary(HEADER, rows)}\n"
-    arguments.output.with_suffix(".md").write_text(table)
+    _common.write_text(arguments.output.with_suffix(".md"), table)
     _figures.plot(HEADER, rows, arguments.output.with_suffix(".png"))
     print(table)
 

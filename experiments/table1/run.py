@@ -3,7 +3,6 @@
 python -m experiments.table1.run [--denoisers NAME_OR_FILE ...] [--mixers NAME_OR_FILE ...]
 """
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -42,21 +41,16 @@ def means(title: str, errors: _mixes.Errors) -> list[tuple]:
 
 
 def main(description: str | None = __doc__, chosen: Sequence[str] = DENOISERS) -> None:
-    parser = _common.parser(description)
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser = _mixes.parser(description)
     parser.add_argument("--denoisers", nargs="*", default=chosen, help="names or files")
     parser.add_argument(
         "--mixers", nargs="*", help="one per denoiser; by default what is shipped for it"
     )
-    parser.add_argument("--spp", type=int, nargs="*", default=_common.SPP)
     arguments = parser.parse_args()
     given = arguments.mixers or [None] * len(arguments.denoisers)
     if len(given) != len(arguments.denoisers):
         parser.error(f"{len(given)} mixers for {len(arguments.denoisers)} denoisers: give one each")
-    pd.enable_compilation_cache()
-    print(_common.machine())
-    names = _common.scenes(arguments.data, arguments.scenes)
-    print(f"{len(names)} scenes of {arguments.data}\n")
+    names = _common.begin(arguments)
 
     found: dict[str, _mixes.Errors] = {}
     for which, mixer_name in zip(arguments.denoisers, given, strict=True):

@@ -3,8 +3,6 @@
 python -m experiments.table3.run [--mixers NAME_OR_FILE ...]
 """
 
-import argparse
-
 import progden_jax as pd
 from experiments import _common, _mixes
 from experiments._mixes import Mix
@@ -15,16 +13,11 @@ WINDOWS = (7, 15, 31)
 
 
 def main() -> None:
-    parser = _common.parser(__doc__)
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser = _mixes.parser(__doc__)
     parser.add_argument("--denoisers", nargs="*", default=("oidn-hdr", "oidn-hdr-alb-nrm"))
     parser.add_argument("--mixers", nargs="*", help="names or files; by default what is shipped")
-    parser.add_argument("--spp", type=int, nargs="*", default=_common.SPP)
     arguments = parser.parse_args()
-    pd.enable_compilation_cache()
-    print(_common.machine())
-    names = _common.scenes(arguments.data, arguments.scenes)
-    print(f"{len(names)} scenes of {arguments.data}\n")
+    names = _common.begin(arguments)
     for which in arguments.denoisers:
         denoiser = pd.denoisers.load(which)
         chosen = arguments.mixers or ([which] if which in mixers.names() else [])

@@ -4,7 +4,6 @@ python -m experiments.table4.train --data ../shared/data/train --output RUNS
 python -m experiments.table4.run --runs RUNS
 """
 
-import argparse
 import json
 from pathlib import Path
 
@@ -47,16 +46,11 @@ def ordering(errors: _mixes.Errors, whole: str, ablations: list[str]) -> str:
 
 
 def main() -> None:
-    parser = _common.parser(__doc__)
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser = _mixes.parser(__doc__)
     parser.add_argument("--runs", type=Path, help="folder that experiments.table4.train wrote")
     parser.add_argument("--denoiser", default="oidn-hdr")
-    parser.add_argument("--spp", type=int, nargs="*", default=_common.SPP)
     arguments = parser.parse_args()
-    pd.enable_compilation_cache()
-    print(_common.machine())
-    names = _common.scenes(arguments.data, arguments.scenes)
-    print(f"{len(names)} scenes of {arguments.data}, {arguments.denoiser}\n")
+    names = _common.begin(arguments, arguments.denoiser)
 
     found = _training.trained(arguments.runs, RUNS)
     if missing := [name for name in RUNS if name not in found]:
