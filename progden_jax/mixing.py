@@ -186,8 +186,13 @@ class Mixer(Protocol):
         sure: Float[Array, "h w 3"],
         *,
         inside: Bool[Array, "h w 1"] | None = None,
+        level: Float[Array, ""] | None = None,
     ) -> Float[Array, "h w 3"]:
-        """α in [0, 1], (H, W, 3). `inside` is False where the arrays are padding around the image."""
+        """α in [0, 1], (H, W, 3).
+
+        `inside` is False where the arrays are padding around the image. `level` is the mean radiance of the
+        whole image where they are a tile of it, which only mixers with a `receptive_radius` are called on.
+        """
         ...
 
 
@@ -206,6 +211,11 @@ class ClosedForm:
                 f"confidence is {self.confidence}, expected a number of standard errors from 0 up."
             )
 
+    @property
+    def receptive_radius(self) -> int:
+        """How many pixels away α can depend on the images."""
+        return self.window // 2
+
     def __call__(
         self,
         x: Float[Array, "h w 3"],
@@ -215,8 +225,9 @@ class ClosedForm:
         sure: Float[Array, "h w 3"],
         *,
         inside: Bool[Array, "h w 1"] | None = None,
+        level: Float[Array, ""] | None = None,
     ) -> Float[Array, "h w 3"]:
-        del sure
+        del sure, level
         return closed_form_alpha(
             x,
             y,

@@ -1,6 +1,9 @@
-"""The whole chain for one frame: repair, denoise, divergence, SURE, mix, bound."""
+"""The whole chain for one frame: repair, denoise, divergence, SURE, mix, bound; whole or window by window."""
 
+import dataclasses
 import functools
+import math
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
 import jax
@@ -9,17 +12,29 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
-from progden_jax import _checks
+from progden_jax import _checks, _windowed, skipping, tiling
+from progden_jax._windowed import Place
 from progden_jax.denoisers import Denoiser
 from progden_jax.divergence import Method, MonteCarlo
 from progden_jax.frame import Frame, Repairs, repair
 from progden_jax.mixers import default_for
 from progden_jax.mixing import Mixer
+from progden_jax.skipping import Skip, Skipped
 from progden_jax.sure import sure
+from progden_jax.survey import BUFFERS, crop, frame_of
 from progden_jax.tstatistic import t_bound
 
 DEFAULT_METHOD = MonteCarlo(probes=1)
 """One probe: averaging windows remove its noise, see experiments/main_job."""
+
+OUTPUTS = ("image", "alpha", "denoised", "sure", "divergence")
+"""Images that a `Result` can have."""
+
+_MOST_TILES = 128
+"""Along an edge, for finding the cheapest windows takes time too."""
+
+_SKIPPABLE = frozenset({"image", "alpha"})
+"""Outputs that are known, x and 0, where a tile is right already."""
 
 
 class Result(NamedTuple):
@@ -33,6 +48,12 @@ class Result(NamedTuple):
     sure : risk estimate of y per pixel, squared radiance, may be negative.
     divergence : the estimate of σ²·∂f/∂x that it rests on.
     repairs : counts of bad pixels, see `progden_jax.repair`.
+    mean_alpha : over pixels and channels.
+    mean_sure : the estimate of the denoised image's mean squared error, over the pixels that were denoised; 0
+        if none was.
+    skipped : what was left out and why; None inside ``jit``, where nothing can be.
+
+    Images that were not asked for are None.
     """
 
     image: Float[Array, "h w 3"]
@@ -41,6 +62,9 @@ class Result(NamedTuple):
     sure: Float[Array, "h w 3"]
     divergence: Float[Array, "h w 3"]
     repairs: Repairs
+    mean_alpha: Float[Array, ""] | None = None
+    mean_sure: Float[Array, ""] | None = None
+    skipped: Skipped | None = None
 
 
 class Denoised(NamedTuple):
@@ -58,12 +82,15 @@ def progressive_denoise(
     method: Method | None = None,
     key: jax.Array | None = None,
     divergence: Float[Array, "h w 3"] | None = None,
+    outputs: Sequence[str] | None = None,
+    skip: Skip | bool = True,
+    max_memory: int | None = None,
 ) -> Result:
     """The mix of render and denoised image that converges to the truth as samples grow.
 
     Compiled once per denoiser and size; sizes are rounded up to a canvas, so that images of nearby sizes
     share a program. Differentiable in the denoiser's weights and in the colour. Inside ``jit``, ``vmap``
-    or ``grad`` the sizes are taken as they are.
+    or ``grad`` the sizes are taken as they are, and nothing is skipped.
 
     Parameters
     ----------
@@ -76,12 +103,20 @@ def progressive_denoise(
     divergence : σ²·∂f/∂x where it is known already, as from `exact_divergence`, of
         ``denoiser.bind(frame)`` for a frame whose bad pixels are repaired (`progden_jax.repair`); then there
         is no method to choose.
+    outputs : images to return, of `OUTPUTS`; None: all. What is not asked for is not kept.
+    skip : leave out tiles that are right already, see `Skip`, where no more than the image and α are asked
+        for: of the other outputs nothing is known there. True stands for ``Skip()``.
+    max_memory : bytes that the call may take beyond the frame itself. A frame that needs more is computed in
+        windows that overlap by what the networks look at, one program for all sizes, and its images come
+        as NumPy arrays. The result is the same to 1e-5, but for methods that weigh the whole frame (`Probing`
+        ranks its variances): these look at each window alone.
 
     Raises
     ------
     ValueError
         If the frame has no variance, is no single image, or lacks what the denoiser takes; if the
-        divergence is no image of its size, or comes with a method.
+        divergence is no image of its size, or comes with a method; if an output has an unknown name; if
+        max_memory is too little for the least window, or the denoiser or mixer cannot work on tiles.
 
     Notes
     -----
@@ -100,64 +135,175 @@ def progressive_denoise(
             raise ValueError(
                 f"a divergence is given and a method, {method!r}, to find it: give one of them."
             )
-    mixer = default_for(denoiser) if mixer is None else mixer
-    method = DEFAULT_METHOD if method is None else method
-    key = jax.random.key(0) if key is None else key
-    return _on_canvas(
-        _progressive, frame, denoiser, mixer, key, images=(divergence,), method=method
+    job = Job(
+        denoiser,
+        default_for(denoiser) if mixer is None else mixer,
+        jax.random.key(0) if key is None else key,
+        DEFAULT_METHOD if method is None else method,
+        _asked(outputs),
     )
+    rule = Skip() if skip is True else skip or None
+    if not _SKIPPABLE.issuperset(job.outputs):
+        rule = None
+    if max_memory is not None:
+        _no_tracers((frame, denoiser, divergence))
+    if max_memory is not None and not _windowed.fits(job, frame, _canvas(frame), max_memory):
+        reach = tiling.margin(denoiser, job.mixer)
+        return _windowed.within(job, frame, divergence, rule, max_memory, reach=reach)
+    if _traced((frame, job, divergence)):
+        return job.program(job, frame, divergence)
+    if rule is not None:
+        return _where_needed(job, frame, divergence, rule)
+    return _whole(job, frame, divergence)
 
 
-def denoise(frame: Frame, denoiser: Denoiser) -> Denoised:
-    """The denoiser alone, with bad pixels repaired: what remains to be had without a variance."""
+def denoise(frame: Frame, denoiser: Denoiser, *, max_memory: int | None = None) -> Denoised:
+    """The denoiser alone, with bad pixels repaired: what remains to be had without a variance.
+
+    `max_memory` is as for `progressive_denoise`.
+    """
     _checks.image("frame.color", frame.color)
-    return _on_canvas(_plain, frame, denoiser)
+    job = _PlainJob(denoiser)
+    if max_memory is not None:
+        _no_tracers((frame, denoiser))
+    if max_memory is not None and not _windowed.fits(job, frame, _canvas(frame), max_memory):
+        return _windowed.within(job, frame, None, None, max_memory, reach=tiling.margin(denoiser))
+    if _traced((frame, denoiser)) or not _has_canvas(denoiser):
+        return job.program(job, frame, None)
+    return _on_canvas(job, frame, None)
 
 
 Valid = tuple[Int[Array, ""], Int[Array, ""]]
 
 
-@functools.partial(jax.jit, static_argnames="method")
-def _progressive(
-    frame: Frame,
-    denoiser: Denoiser,
-    divergence: Array | None,
-    mixer: Mixer,
-    key: jax.Array,
-    valid: Valid | None = None,
-    *,
-    method: Method,
-) -> Result:
-    frame, inside, repairs = _prepare(frame, valid)
-    x, variance = frame.color, cast(Array, frame.variance)
-    f = _bind(denoiser, frame, valid)
-    if divergence is None:
-        y, divergence, *_ = method.evaluate(f, x, variance, key)
-    else:
-        y = f(x)
-    risk = sure(x, y, variance, divergence)
-    alpha = mixer(x, y, variance, divergence, risk, inside=inside)
-    alpha = t_bound(alpha, x, y, variance, inside=inside)
-    return Result(x + alpha * (y - x), alpha, y, risk, divergence, repairs)
+@functools.partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("denoiser", "mixer", "key"),
+    meta_fields=("method", "outputs"),
+)
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """What holds for every window of a frame, and for every frame of a batch: a pytree."""
+
+    denoiser: Denoiser
+    mixer: Mixer
+    key: jax.Array
+    method: Method
+    outputs: tuple[str, ...]
+
+    @property
+    def program(self) -> Any:
+        """The compiled function of (job, frame, divergence, valid, place) to a `Result`."""
+        return _progressive
+
+    @staticmethod
+    def result(images: Mapping[str, Any], **rest: Any) -> Result:
+        """From the images that were asked for, and the other fields."""
+        return Result(**{name: images.get(name) for name in OUTPUTS}, **rest)
 
 
 @jax.jit
-def _plain(frame: Frame, denoiser: Denoiser, valid: Valid | None = None) -> Denoised:
-    frame, _, repairs = _prepare(frame, valid)
-    return Denoised(_bind(denoiser, frame, valid)(frame.color), repairs)
+def _progressive(
+    job: Job,
+    frame: Frame,
+    divergence: Array | None,
+    valid: Valid | None = None,
+    place: Place | None = None,
+) -> Result:
+    frame, inside, repairs = _prepare(frame, valid, place)
+    x, variance = frame.color, cast(Array, frame.variance)
+    f = _bind(job.denoiser, frame, valid, place)
+    if divergence is None:
+        origin = {} if place is None else {"origin": place.origin}
+        y, divergence, *_ = job.method.evaluate(f, x, variance, job.key, **origin)
+    else:
+        y = f(x)
+    risk = sure(x, y, variance, divergence)
+    told = {} if place is None else {"level": place.level}
+    alpha = job.mixer(x, y, variance, divergence, risk, inside=inside, **told)
+    mean_variance = None if place is None else place.mean_variance
+    alpha = t_bound(alpha, x, y, variance, mean_variance=mean_variance, inside=inside)
+    images = {
+        "image": x + alpha * (y - x),
+        "alpha": alpha,
+        "denoised": y,
+        "sure": risk,
+        "divergence": divergence,
+    }
+    counted = inside if place is None else _core(frame.size, place)
+    return job.result(
+        {name: images[name] for name in job.outputs},
+        repairs=repairs,
+        mean_alpha=_mean(alpha, counted),
+        mean_sure=_mean(risk, counted),
+    )
 
 
-def _prepare(frame: Frame, valid: Valid | None) -> tuple[Frame, Array | None, Repairs]:
+@functools.partial(jax.tree_util.register_dataclass, data_fields=("denoiser",), meta_fields=())
+@dataclasses.dataclass(frozen=True)
+class _PlainJob:
+    denoiser: Denoiser
+    outputs = ("image",)
+    method = None
+
+    @property
+    def program(self) -> Any:
+        return _plain
+
+    @staticmethod
+    def result(images: Mapping[str, Any], *, repairs: Repairs, **_: Any) -> Denoised:
+        return Denoised(images["image"], repairs)
+
+
+@jax.jit
+def _plain(
+    job: _PlainJob,
+    frame: Frame,
+    divergence: None,
+    valid: Valid | None = None,
+    place: Place | None = None,
+) -> Denoised:
+    del divergence
+    frame, _, repairs = _prepare(frame, valid, place)
+    image = _bind(job.denoiser, frame, valid, place)(frame.color)
+    return Denoised(image, cast(Repairs, repairs))
+
+
+def _prepare(
+    frame: Frame, valid: Valid | None, place: Place | None
+) -> tuple[Frame, Array | None, Repairs | None]:
     inside = None
     if valid is not None:
         rows, columns = (jnp.arange(n) < v for n, v in zip(frame.size, valid, strict=True))
         inside = (rows[:, None] & columns[None, :])[..., None]
+    if place is not None:
+        return frame, inside, None
     repaired, repairs = repair(frame, inside=inside)
     return repaired, inside, repairs
 
 
-def _bind(denoiser: Denoiser, frame: Frame, valid: Valid | None) -> Any:
-    return denoiser.bind(frame) if valid is None else denoiser.bind(frame, valid=valid)  # pyright: ignore[reportCallIssue]
+def _bind(
+    denoiser: Denoiser, frame: Frame, valid: Valid | None, place: Place | None
+) -> Callable[[Array], Array]:
+    known = {} if valid is None else {"valid": valid}
+    if place is not None:
+        known["exposure"] = place.exposure
+    return denoiser.bind(frame, **known)
+
+
+def _core(size: tuple[int, int], place: Place) -> Array:
+    top, bottom, left, right = place.core
+    rows, columns = (jnp.arange(n) for n in size)
+    return (((rows >= top) & (rows < bottom))[:, None] & ((columns >= left) & (columns < right)))[
+        ..., None
+    ]
+
+
+def _mean(image: Array, counted: Array | None) -> Array:
+    """Over the pixels that count; a huge frame's sum would have no digits left."""
+    if counted is None:
+        return image.mean()
+    return jnp.where(counted, image, 0).sum() / (image.shape[-1] * jnp.maximum(counted.sum(), 1))
 
 
 def canvas_size(n: int) -> int:
@@ -166,44 +312,79 @@ def canvas_size(n: int) -> int:
     return -(-n // step) * step
 
 
-def _on_canvas(
-    run: Any,
-    frame: Frame,
-    denoiser: Denoiser,
-    *arguments: Any,
-    images: tuple[Array | None, ...] = (),
-    **static: Any,
-) -> Any:
-    """`run` on the frame and images padded to its canvas, cropped again, unless tracing or the
-    denoiser forbids it."""
-    size = frame.size
-    canvas = tuple(canvas_size(n) for n in size)
-    leaves = jax.tree.leaves((frame, denoiser, images))
-    traced = any(isinstance(leaf, Tracer) for leaf in leaves)
-    if traced or not getattr(denoiser, "canvas", False):
-        return run(frame, denoiser, *images, *arguments, **static)
-    padding = [(0, big - small) for big, small in zip(canvas, size, strict=True)] + [(0, 0)]
-
-    def pad(buffer: Array) -> Any:
-        return np.pad(np.asarray(buffer), padding) if canvas != size else buffer
-
-    padded = {}
-    for name in ("color", "variance", "albedo", "normal", "depth"):
-        buffer = getattr(frame, name)
-        if buffer is not None:
-            padded[name] = pad(buffer)
-    valid = tuple(np.int32(n) for n in size)
-    result = run(
-        Frame(padded.pop("color"), padded.pop("variance", None), **padded),
-        denoiser,
-        *(None if image is None else pad(image) for image in images),
-        *arguments,
-        valid,
-        **static,
-    )
-    if canvas == size:
+def _on_canvas(job: Any, frame: Frame, divergence: Array | None) -> Any:
+    """The job on the whole frame, padded to its canvas, and its images cropped again."""
+    canvas = _canvas(frame)
+    buffers = {n: getattr(frame, n) for n in BUFFERS if getattr(frame, n) is not None}
+    if canvas != frame.size:
+        buffers = {name: crop(buffer, (0, 0), canvas) for name, buffer in buffers.items()}
+        divergence = None if divergence is None else crop(divergence, (0, 0), canvas)
+    valid = tuple(np.int32(n) for n in frame.size)
+    result = job.program(job, frame_of(buffers), divergence, valid)
+    if canvas == frame.size:
         return result
-    height, width = size
+    height, width = frame.size
     return jax.tree.map(
         lambda a: jnp.asarray(np.asarray(a)[:height, :width]) if a.ndim else a, result
     )
+
+
+def _where_needed(job: Job, frame: Frame, divergence: Array | None, skip: Skip) -> Result:
+    """The frame but for the tiles that are right already."""
+    variance = cast(Array, frame.variance)
+    canvas = _canvas(frame)
+    skip = dataclasses.replace(skip, tile=max(skip.tile, math.ceil(max(canvas) / _MOST_TILES)))
+    active = skipping.noisy_tiles(
+        crop(frame.color, (0, 0), canvas), crop(variance, (0, 0), canvas), skip
+    )
+    windows = None
+    if not active.any():
+        windows = []
+    elif _has_canvas(job.denoiser) and tiling.can_tile(job.denoiser, job.mixer):
+        reach = tiling.margin(job.denoiser, job.mixer)
+        step = cast(Any, job.denoiser).alignment
+        windows = tiling.Cover(frame.size, canvas, skip.tile, reach, step).windows(active)
+    if windows is None or any(w.shape == canvas for w in windows):
+        return _whole(job, frame, divergence)
+    return _windowed.assemble(job, frame, divergence, windows, skip)
+
+
+def _whole(job: Job, frame: Frame, divergence: Array | None) -> Result:
+    if _has_canvas(job.denoiser):
+        result = _on_canvas(job, frame, divergence)
+    else:
+        result = job.program(job, frame, divergence)
+    return result._replace(skipped=Skipped(0, frame.size[0] * frame.size[1]))
+
+
+def _canvas(frame: Frame) -> tuple[int, int]:
+    height, width = frame.size
+    return canvas_size(height), canvas_size(width)
+
+
+def _has_canvas(denoiser: Denoiser) -> bool:
+    return getattr(denoiser, "canvas", False)
+
+
+def _traced(values: Any) -> bool:
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
+
+
+def _no_tracers(values: Any) -> None:
+    if _traced(values):
+        raise ValueError(
+            "max_memory is given inside jit, vmap or grad, where a frame cannot be cut into windows: "
+            "leave it out, or call from outside."
+        )
+
+
+def _asked(outputs: Sequence[str] | None) -> tuple[str, ...]:
+    if outputs is None:
+        return OUTPUTS
+    if isinstance(outputs, str):
+        raise ValueError(
+            f"outputs is {outputs!r}, expected a sequence of names, such as ('image',)."
+        )
+    for name in outputs:
+        _checks.choice("outputs", name, OUTPUTS)
+    return tuple(name for name in OUTPUTS if name in outputs)

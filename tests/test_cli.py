@@ -416,6 +416,32 @@ def test_variance_of_samples_std_and_moments_agree(tmp_path, frames, progden):
 # Bad input: a clear error, or a finite result with the counts reported.
 
 
+def test_what_is_right_is_skipped_and_told(tmp_path, frames, progden):
+    variance = np.asarray(frames[8].variance)
+    path, out = tmp_path / "a.exr", tmp_path / "o.exr"
+    write_exr(path, frames[8].replace(variance=np.where(variance > 0, 1e-9, 0)))
+    command = ["denoise", path, "-o", out, "--force"]
+    status, stdout, _ = progden(*command, "--converged", "10")
+    assert (status, "100% skipped as right already" in stdout) == (0, True)
+    np.testing.assert_array_equal(read_exr(out).color, frames[8].color)
+    status, stdout, _ = progden(*command, "--no-skip", "--json")
+    (found,) = report(stdout)
+    assert (found["skipped"], found["skipped_why"]) == (0, None)
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--max-memory", "many"], "--max-memory: the size is 'many'"),
+        (["--converged", "-1"], "--converged: tolerance is -1"),
+        (["--no-skip", "--converged", "0.1"], "--no-skip forbids it"),
+    ],
+)
+def test_bounds_that_are_wrong(tmp_path, noisy, progden, flags, message):
+    status, _, stderr = progden("denoise", noisy, "-o", tmp_path / "o.exr", *flags)
+    assert (status, message in stderr) == (2, True), stderr
+
+
 def test_no_variance_is_denoised_plainly_and_says_so(tmp_path, frames, progden):
     write_exr(tmp_path / "a.exr", frames[8].replace(variance=None))
     out = tmp_path / "o.exr"

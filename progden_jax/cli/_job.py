@@ -12,12 +12,19 @@ import numpy as np
 import progden_jax as pd
 from progden_jax import mixers
 from progden_jax.cli._compare import Scores, compare
-from progden_jax.cli._options import SAVE_ALWAYS, EstimateOptions, NetworkOptions, ReadOptions
+from progden_jax.cli._options import (
+    SAVE_ALWAYS,
+    CostOptions,
+    EstimateOptions,
+    NetworkOptions,
+    ReadOptions,
+)
 from progden_jax.cli._paths import Item
 from progden_jax.cli._run import Failure, complain
 from progden_jax.compilation import cache_folder
 from progden_jax.divergence.running import ExactRun
 from progden_jax.exr import ExrInfo, read_exr_with_info, write_exr
+from progden_jax.pipeline import OUTPUTS
 
 
 @dataclass(frozen=True)
@@ -27,6 +34,7 @@ class Settings:
     read: ReadOptions
     network: NetworkOptions
     estimate: EstimateOptions
+    cost: CostOptions
     save: tuple[str, ...] = ()
     half: bool = False
     force: bool = False
@@ -51,6 +59,8 @@ class Outcome:
     mixer: str | None = None
     mean_alpha: float | None = None
     mean_sure: float | None = None
+    skipped: float | None = None
+    skipped_why: str | None = None
     repairs: dict[str, int] = field(default_factory=dict)
     metrics: Scores | None = None
     seconds: float | None = None
@@ -67,6 +77,8 @@ class Outcome:
             facts.append("denoised plainly")
         else:
             facts.append(f"mean α {self.mean_alpha:.2f}")
+        if self.skipped:
+            facts.append(f"{self.skipped:.0%} skipped as right already")
         facts.append(f"{self.seconds:.1f} s")
         text = f"{self.input} → {self.output}: {', '.join(facts)}"
         bad = [f"{n} {_REPAIRS[name]}" for name, n in self.repairs.items() if n]
@@ -115,7 +127,7 @@ def process(item: Item, settings: Settings, outcome: Outcome, progress: Progress
     frame = _with_usable_variance(frame, info, outcome)
     frame, denoiser = settings.network.load(frame)
     outcome.denoiser, outcome.auxiliary = denoiser.name, denoiser.inputs
-    images, checkpoint = _denoise(frame, denoiser, settings.estimate, outcome, progress)
+    images, checkpoint = _denoise(item, frame, denoiser, settings, outcome, progress)
     if reference is not None:
         outcome.metrics = _measure(images, reference)
     _write(item, images, info, settings, outcome)
@@ -166,17 +178,22 @@ def _repaired(frame: pd.Frame) -> np.ndarray:
 
 
 def _denoise(
+    item: Item,
     frame: pd.Frame,
     denoiser: pd.Denoiser,
-    estimate: EstimateOptions,
+    settings: Settings,
     outcome: Outcome,
     progress: Progress,
 ) -> tuple[_Images, Path | None]:
     """The images, and a file to be removed once they are written."""
     checkpoint = None
+    estimate = settings.estimate
+    max_memory = settings.cost.max_bytes()
+    if max_memory is not None:
+        max_memory -= sum(leaf.nbytes for leaf in jax.tree.leaves(frame))
     if frame.variance is None:
         outcome.mode = "plain"
-        denoised, repairs = pd.denoise(frame, denoiser)
+        denoised, repairs = pd.denoise(frame, denoiser, max_memory=max_memory)
         image = np.asarray(denoised)
         maps = {"denoised": image}
     else:
@@ -188,15 +205,26 @@ def _denoise(
             how = {"divergence": divergence}
         mixer = mixers.load(estimate.mixer) if estimate.mixer else mixers.default_for(denoiser)
         outcome.mixer = repr(mixer)
+        compared = set() if item.reference is None else {"denoised"}
+        names = [n for n in OUTPUTS if n in {"image", *settings.save, *compared}]
         result = pd.progressive_denoise(
-            frame, denoiser, mixer=mixer, key=jax.random.key(estimate.seed), **how
+            frame,
+            denoiser,
+            mixer=mixer,
+            key=jax.random.key(estimate.seed),
+            outputs=names,
+            skip=settings.cost.rule(),
+            max_memory=max_memory,
+            **how,
         )
         repairs, image = result.repairs, np.asarray(result.image)
-        names = ("alpha", "denoised", "sure", "divergence")
-        maps = {name: np.asarray(getattr(result, name)) for name in names}
+        maps = {name: np.asarray(getattr(result, name)) for name in names if name != "image"}
         maps["variance"] = np.asarray(frame.variance)
-        outcome.mean_alpha = float(maps["alpha"].mean(dtype=np.float64))
-        outcome.mean_sure = float(maps["sure"].mean(dtype=np.float64))
+        outcome.mean_alpha = float(np.asarray(result.mean_alpha))
+        outcome.mean_sure = float(np.asarray(result.mean_sure))
+        if result.skipped is not None:
+            outcome.skipped = result.skipped.pixels / (frame.size[0] * frame.size[1])
+            outcome.skipped_why = result.skipped.reason or None
     maps["noisy"] = np.asarray(frame.color)
     outcome.repairs = {name: int(n) for name, n in repairs._asdict().items()}
     if not np.isfinite(image).all():

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from progden_jax.divergence import Method
     from progden_jax.exr import Settings
     from progden_jax.frame import Frame
+    from progden_jax.skipping import Skip
 
 Quality = Literal["fast", "balanced", "high"]
 VarianceOf = Literal["mean", "samples", "std", "second-moment"]
@@ -269,6 +270,59 @@ class EstimateOptions:
             return getattr(pd, choice.type)(**settings)
         except ValueError as error:
             raise UsageError(f"--method {self.method}: {error}") from error
+
+
+@Parameter(name="*", group="Run time and memory")
+@dataclass(frozen=True)
+class CostOptions:
+    """What a run may take, and what it may leave out."""
+
+    max_memory: Annotated[
+        str | None,
+        Parameter(
+            help="Upper bound, such as 4GiB: images that need more are computed in parts, with the same "
+            "result."
+        ),
+    ] = None
+    no_skip: Annotated[
+        bool,
+        Parameter(help="Compute tiles, too, whose noise is nothing already."),
+    ] = False
+    converged: Annotated[
+        float | None,
+        Parameter(
+            help="What counts as nothing: a standard error of at most this share of the radiance "
+            "[default: 1e-6, which changes no result]."
+        ),
+    ] = None
+
+    def check(self) -> None:
+        """Raise UsageError for what is wrong whatever the files hold."""
+        if self.max_memory is not None:
+            self.max_bytes()
+        if self.converged is not None and self.no_skip:
+            raise UsageError("--converged says what to skip, and --no-skip forbids it.")
+        self.rule()
+
+    def max_bytes(self) -> int | None:
+        """The bound in bytes."""
+        from progden_jax.memory import parse_size
+
+        try:
+            return None if self.max_memory is None else parse_size(self.max_memory)
+        except ValueError as error:
+            raise UsageError(f"--max-memory: {error}") from None
+
+    def rule(self) -> "Skip | bool":
+        """What `progressive_denoise` takes as skip."""
+        from progden_jax.skipping import Skip
+
+        if self.converged is None:
+            return not self.no_skip
+        try:
+            return Skip(self.converged)
+        except ValueError as error:
+            raise UsageError(f"--converged: {error}") from None
 
 
 def parse_save(text: str | None) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ from cyclopts import Parameter
 
 from progden_jax.cli._options import (
     SAVE,
+    CostOptions,
     EstimateOptions,
     NetworkOptions,
     ReadOptions,
@@ -33,6 +34,7 @@ is denoised plainly. Nothing is replaced without --force.
 progden denoise room.exr -o clean.exr
 progden denoise frames/ -o clean/ --quality high --save alpha,sure
 progden denoise room.exr -o clean.exr --variance-from roomA.exr roomB.exr
+progden denoise huge.exr -o clean.exr --max-memory 4GiB
 ```
 """
 
@@ -51,6 +53,7 @@ def denoise(
     read: ReadOptions | None = None,
     network: NetworkOptions | None = None,
     estimate: EstimateOptions | None = None,
+    cost: CostOptions | None = None,
     save: Annotated[
         str | None,
         Parameter(help=f"Further layers for the output, with commas: {', '.join(SAVE)}."),
@@ -68,9 +71,9 @@ def denoise(
     ] = False,
 ) -> int:
     read, network = read or ReadOptions(), network or NetworkOptions()
-    estimate = estimate or EstimateOptions()
+    estimate, cost = estimate or EstimateOptions(), cost or CostOptions()
     saved = parse_save(save)
-    for options in (read, network, estimate):
+    for options in (read, network, estimate, cost):
         options.check()
     if network.no_aux and {"albedo", "normal"} & set(saved):
         raise UsageError("--no-aux leaves albedo and normal out, and --save asks for them.")
@@ -86,7 +89,7 @@ def denoise(
     from progden_jax.cli._job import Settings, process
 
     enable_compilation_cache()
-    settings = Settings(read, network, estimate, saved, half, force)
+    settings = Settings(read, network, estimate, cost, saved, half, force)
     return _run_all(
         items,
         lambda item, outcome, progress: process(item, settings, outcome, progress),

@@ -19,7 +19,9 @@ class Denoiser(Protocol):
     A denoiser that is a pytree with its weights as leaves can be passed through ``jax.jit`` and
     ``jax.grad``; any other object is treated as a constant. A denoiser whose class sets
     ``canvas = True`` takes ``bind(frame, valid=(height, width))`` for a frame padded beyond its true
-    size, and then one compiled program serves images of nearby sizes.
+    size, and then one compiled program serves images of nearby sizes. One that also has
+    ``receptive_radius`` and ``alignment`` in pixels and ``exposure_of(frame, valid)``, and takes what the
+    latter gives as ``bind(..., exposure=...)``, can work on tiles: see `Tileable`.
     """
 
     def __call__(self, frame: Frame) -> Float[Array, "h w 3"]:

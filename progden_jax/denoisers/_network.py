@@ -90,10 +90,11 @@ class Network:
         """
         return _jitted_call(self, frame)
 
-    def bind(self, frame: Frame, *, valid: Valid = None) -> Bound:
+    def bind(self, frame: Frame, *, valid: Valid = None, exposure: Any = None) -> Bound:
         """f with y = f(x) for the frame's other buffers, constants; a pytree, so it passes through jit.
 
         `valid` is the true (height, width), may be traced, of a frame padded beyond it with zeros.
+        `exposure` is what `exposure_of` says of the whole image, where the frame is a tile of it.
         """
         _checks.image("frame.color", frame.color)
         auxiliary = []
@@ -105,12 +106,19 @@ class Network:
                     "choose a network with fewer inputs, such as 'oidn-hdr', or give the buffer."
                 )
             auxiliary.append(self.transferred(role, jnp.nan_to_num(buffer, nan=0.0)))
-        return BoundNetwork(self, tuple(auxiliary), self.exposure_of(frame, valid), valid)
+        if exposure is None:
+            exposure = self.exposure_of(frame, valid)
+        return BoundNetwork(self, tuple(auxiliary), exposure, valid)
 
     @property
     def receptive_radius(self) -> int:
         """How many pixels away an output pixel can depend on the input."""
         return graph.receptive_radius(self.nodes, self.params)
+
+    @property
+    def alignment(self) -> int:
+        """Pixels after which the way that outputs depend on inputs repeats."""
+        return graph.alignment(self.nodes)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.name!r}, inputs={self.inputs})"
@@ -162,7 +170,7 @@ class BoundNetwork:
     @property
     def alignment(self) -> int:
         """Pixels after which the way that outputs depend on inputs repeats."""
-        return graph.alignment(self.denoiser.nodes)
+        return self.denoiser.alignment
 
     @property
     def layers(self) -> tuple[tuple[Node, ...], Params]:

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from progden_jax import _checks
 from progden_jax._numeric import safe_sqrt
+from progden_jax.divergence._random import Origin
 
 Function = Callable[[Float[Array, "h w 3"]], Float[Array, "h w 3"]]
 """A denoiser bound to everything but the colour."""
@@ -56,8 +57,14 @@ class Method(Protocol):
         x: Float[Array, "h w 3"],
         variance: Float[Array, "h w 3"],
         key: jax.Array,
+        *,
+        origin: Origin = (0, 0),
     ) -> Evaluation:
-        """f at `x`, the divergence there and its standard error; arguments are checked already."""
+        """f at `x`, the divergence there and its standard error; arguments are checked already.
+
+        `origin` is where x lies in the whole image, if it is a tile of one: random numbers belong to
+        positions there.
+        """
         ...
 
 

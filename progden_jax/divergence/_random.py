@@ -12,6 +12,9 @@ from jaxtyping import Array, Float, UInt32
 
 Words = tuple[Array, Array, Array, Array]
 
+Origin = tuple[Array | int, Array | int]
+"""Row and column, in the whole image, of an array's first pixel."""
+
 
 def _hash(x: Array, y: Array, z: Array, w: Array) -> Words:
     """pcg4d of Jarzynski and Olano 2020: four words that depend on all of four words."""
@@ -29,7 +32,7 @@ def _stir(x: Array, y: Array, z: Array, w: Array) -> Words:
 
 
 def _bits(
-    key: jax.Array, probe: Array | int, like: Float[Array, "h w c"]
+    key: jax.Array, probe: Array | int, like: Float[Array, "h w c"], origin: Origin
 ) -> UInt32[Array, "h w c"]:
     height, width, channels = like.shape
     state: Words = (jnp.asarray(probe).astype(jnp.uint32), *[jnp.uint32(0)] * 3)
@@ -37,23 +40,26 @@ def _bits(
         state = _hash(state[0], state[1], state[2], state[3] ^ word)
     # Twice, for neighbouring seeds and probes differ in a bit or two.
     a, b, c, d = _hash(*state)
-    row = jnp.arange(height, dtype=jnp.uint32)[:, None, None] ^ a
-    column = jnp.arange(width, dtype=jnp.uint32)[:, None] ^ b
+    first, left = (jnp.asarray(n).astype(jnp.uint32) for n in origin)
+    row = (jnp.arange(height, dtype=jnp.uint32) + first)[:, None, None] ^ a
+    column = (jnp.arange(width, dtype=jnp.uint32) + left)[:, None] ^ b
     channel = jnp.arange(channels, dtype=jnp.uint32) ^ c
     return _hash(row, column, channel, d)[3]
 
 
 @jax.jit
 def normal(
-    key: jax.Array, probe: Array | int, like: Float[Array, "h w c"]
+    key: jax.Array, probe: Array | int, like: Float[Array, "h w c"], origin: Origin = (0, 0)
 ) -> Float[Array, "h w c"]:
     """Standard normal values for the probe of this number, at most 5.3 in magnitude."""
     # The middles of 2^23 equal parts of (-1, 1).
-    uniform = ((_bits(key, probe, like) >> 9).astype(like.dtype) + 0.5) * 2.0**-22 - 1
+    uniform = ((_bits(key, probe, like, origin) >> 9).astype(like.dtype) + 0.5) * 2.0**-22 - 1
     return 2**0.5 * lax.erf_inv(uniform)
 
 
 @jax.jit
-def signs(key: jax.Array, probe: Array | int, like: Float[Array, "h w c"]) -> Float[Array, "h w c"]:
+def signs(
+    key: jax.Array, probe: Array | int, like: Float[Array, "h w c"], origin: Origin = (0, 0)
+) -> Float[Array, "h w c"]:
     """Values ±1 with equal probability for the probe of this number."""
-    return 1 - 2 * (_bits(key, probe, like) >> 31).astype(like.dtype)
+    return 1 - 2 * (_bits(key, probe, like, origin) >> 31).astype(like.dtype)

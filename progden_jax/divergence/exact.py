@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from progden_jax import _checks
 from progden_jax.denoisers import graph
 from progden_jax.divergence import _reach, cone, windows
-from progden_jax.divergence._base import Evaluation, Function
+from progden_jax.divergence._base import Evaluation, Function, Origin
 
 ALGORITHMS = ("auto", "basis", "coloring", "cone")
 
@@ -86,8 +86,10 @@ class Exact:
         x: Float[Array, "h w 3"],
         variance: Float[Array, "h w 3"],
         key: jax.Array,
+        *,
+        origin: Origin = (0, 0),
     ) -> Evaluation:
-        del key
+        del key, origin
         algorithm = self.choose(f, x)
         if algorithm == "cone":
             value, diagonal = self._by_cone(f, x)

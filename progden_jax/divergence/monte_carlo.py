@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from progden_jax import _checks
 from progden_jax._numeric import safe_sqrt
 from progden_jax.divergence import _random
-from progden_jax.divergence._base import Evaluation, Function, accumulate
+from progden_jax.divergence._base import Evaluation, Function, Origin, accumulate
 
 
 @jax.tree_util.register_static
@@ -43,12 +43,14 @@ class FiniteDifference:
         x: Float[Array, "h w 3"],
         variance: Float[Array, "h w 3"],
         key: jax.Array,
+        *,
+        origin: Origin = (0, 0),
     ) -> Evaluation:
         value = f(x)
         sigma = safe_sqrt(variance)
 
         def sample(probe: Array) -> Array:
-            b = sigma * _random.normal(key, probe, x)
+            b = sigma * _random.normal(key, probe, x, origin)
             return b * (f(x + self.epsilon * b) - value) / self.epsilon
 
         return Evaluation(value, *accumulate(sample, self.probes, self.chunk, value))
@@ -85,13 +87,15 @@ class MonteCarlo:
         x: Float[Array, "h w 3"],
         variance: Float[Array, "h w 3"],
         key: jax.Array,
+        *,
+        origin: Origin = (0, 0),
     ) -> Evaluation:
         draw = _random.signs if self.distribution == "rademacher" else _random.normal
         value, tangent = jax.linearize(f, x)
         sigma = safe_sqrt(variance)
 
         def sample(probe: Array) -> Array:
-            b = sigma * draw(key, probe, x)
+            b = sigma * draw(key, probe, x, origin)
             return b * tangent(b)
 
         return Evaluation(value, *accumulate(sample, self.probes, self.chunk, value))

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 from progden_jax import _checks
 from progden_jax._numeric import safe_sqrt
 from progden_jax.divergence import _adaptive, _random
-from progden_jax.divergence._base import Evaluation, Function, accumulate
+from progden_jax.divergence._base import Evaluation, Function, Origin, accumulate
 
 MOST_PROBES = 1024
 """Number of colours of the lattice, and so of probes before the pattern repeats."""
@@ -122,15 +122,19 @@ class Probing:
         x: Float[Array, "h w 3"],
         variance: Float[Array, "h w 3"],
         key: jax.Array,
+        *,
+        origin: Origin = (0, 0),
     ) -> Evaluation:
         value, tangent = jax.linearize(f, x)
         weight, gain = weight_and_gain(safe_sqrt(variance), value, self.scale)
-        pixel_colors = colors(*x.shape[:2])
+        pixel_colors = colors(*x.shape[:2], origin=origin)
         probes, replicates = self._counts
         each = probes // replicates
 
         def sample(probe: Array, replicate: Array) -> Array:
-            pattern = _random.signs(key, replicate, x) * walsh(probe, pixel_colors).astype(x.dtype)
+            pattern = _random.signs(key, replicate, x, origin) * walsh(probe, pixel_colors).astype(
+                x.dtype
+            )
             return gain * pattern * tangent(weight * pattern)
 
         if self.tolerance is not None:
@@ -156,7 +160,7 @@ class Probing:
 
         def either(probe: Array) -> Array:
             structured = probe < shared
-            pattern = _random.signs(key, 0, x) * walsh(probe, pixel_colors).astype(x.dtype)
+            pattern = _random.signs(key, 0, x, origin) * walsh(probe, pixel_colors).astype(x.dtype)
             unit = (place == outliers[jnp.clip(probe - shared, 0)]).astype(x.dtype)
             found = tangent(jnp.where(structured, weight * pattern, unit))
             share = probes / shared.astype(x.dtype)
@@ -198,12 +202,15 @@ def deflated(
     return index, jnp.where(error[number] <= _WORTH_A_PROBE, number, 0)
 
 
-def colors(height: int, width: int) -> Int[Array, "h w 3"]:
+def colors(height: int, width: int, *, origin: Origin = (0, 0)) -> Int[Array, "h w 3"]:
     """Each pixel's colour in 0..1023, by its position alone.
 
     Reduced modulo 2^n it is a lattice colouring with 2^n colours for each n, the channels shifted.
     """
-    rows, columns = jnp.arange(height)[:, None, None], jnp.arange(width)[None, :, None]
+    rows, columns = (
+        jnp.arange(n) + first for n, first in zip((height, width), origin, strict=True)
+    )
+    rows, columns = rows[:, None, None], columns[None, :, None]
     return (columns + _ROW_STEP * rows + jnp.asarray(_CHANNEL_STEPS)) % MOST_PROBES
 
 

@@ -68,13 +68,19 @@ class NetworkMixer:
         sure: Float[Array, "h w 3"],
         *,
         inside: Bool[Array, "h w 1"] | None = None,
+        level: Float[Array, ""] | None = None,
     ) -> Float[Array, "h w 3"]:
         """α in [0, 1], (H, W, 3); see `Mixer`."""
         # GPUs would else take TF32.
         with jax.default_matmul_precision("highest"):
             return self.architecture.apply(
-                self.params, x, y, variance, divergence, sure, inside=inside
+                self.params, x, y, variance, divergence, sure, inside=inside, level=level
             )
+
+    @property
+    def receptive_radius(self) -> int:
+        """How many pixels away α can depend on the images."""
+        return self.architecture.receptive_radius
 
     def __repr__(self) -> str:
         return f"NetworkMixer({self.architecture})"

@@ -19,6 +19,11 @@ class Architecture(Protocol):
     Leading axes of the images are a batch.
     """
 
+    @property
+    def receptive_radius(self) -> int:
+        """How many pixels away α can depend on the images."""
+        ...
+
     def init(self, key: jax.Array) -> Params:
         """Weights to start training from."""
         ...
@@ -33,6 +38,7 @@ class Architecture(Protocol):
         sure: Float[Array, "*b h w 3"],
         *,
         inside: Bool[Array, "h w 1"] | None = None,
+        level: Float[Array, ""] | None = None,
     ) -> Float[Array, "*b h w 3"]:
         """α in [0, 1]; as if the image ended where `inside` is False."""
         ...

@@ -36,6 +36,11 @@ class Paper:
         _checks.positive_int("width", self.width)
         _checks.choice("space", self.space, ("linear", "log"))
 
+    @property
+    def receptive_radius(self) -> int:
+        """How many pixels away α can depend on the images: one 5×5 and five 3×3 convolutions."""
+        return 2 + 5
+
     def init(self, key: jax.Array) -> Params:
         """He's random kernels and zero biases; the last layer's are such that f_act begins with a slope.
 
@@ -58,8 +63,9 @@ class Paper:
         sure: Float[Array, "*b h w 3"],
         *,
         inside: Bool[Array, "h w 1"] | None = None,
+        level: Float[Array, ""] | None = None,
     ) -> Float[Array, "*b h w 3"]:
-        del divergence
+        del divergence, level
         features = mixing_features(x, y, variance, sure)
         if not self.sure:
             shown = jnp.repeat(jnp.asarray([True, True, True, False, True, False]), 3)

@@ -53,6 +53,11 @@ class Multiscale:
             _checks.choice("without", group, GROUPS)
         _checks.choice("start", self.start, ("closed-form", "none"))
 
+    @property
+    def receptive_radius(self) -> int:
+        """How many pixels away α can depend on the images: the brightness is averaged twice."""
+        return 15 // 2 + WINDOWS[-1] // 2 + 2 * self.blocks + 1
+
     def init(self, key: jax.Array) -> Params:
         """Weights that give the closed form: the last layer is zero."""
         return self._net.init(key, jnp.zeros((1, 8, 8, CHANNELS)), None)["params"]
@@ -67,12 +72,13 @@ class Multiscale:
         sure: Float[Array, "*b h w 3"],
         *,
         inside: Bool[Array, "h w 1"] | None = None,
+        level: Float[Array, ""] | None = None,
     ) -> Float[Array, "*b h w 3"]:
         """α in [0, 1]; as if the image ended where `inside` is False. 0 where a window has no variance."""
         del sure
 
         def prepared(*images: Array) -> tuple[Array, Array, Array]:
-            return features(*images, inside=inside, without=self.without)
+            return features(*images, inside=inside, level=level, without=self.without)
 
         for _ in range(x.ndim - 3):
             prepared = jax.vmap(prepared)
@@ -123,6 +129,7 @@ def features(
     divergence: Float[Array, "h w 3"],
     *,
     inside: Bool[Array, "h w 1"] | None = None,
+    level: Float[Array, ""] | None = None,
     without: tuple[str, ...] = (),
 ) -> tuple[Float[Array, "h w f"], Float[Array, "h w 3"], Bool[Array, "h w 3"]]:
     """What the network sees, the closed form over 15×15 windows, and where such a window has variance.
@@ -136,6 +143,7 @@ def features(
     ----------
     x, y, variance, divergence : (H, W, 3), see `progden_jax.sure`.
     inside : (H, W, 1) False where they are padding around the image.
+    level : mean radiance of the whole image, where these are a tile of it; by default that of `x`.
     without : `GROUPS` of features to give as zeros.
     """
     counted = jnp.ones_like(x[..., :1]) if inside is None else inside.astype(x.dtype)
@@ -145,9 +153,11 @@ def features(
         return _windows.box_sum(value, window) / jnp.maximum(_windows.box_sum(counted, window), 1)
 
     # In units of the image's mean no square here leaves float32's range, nor its derivatives.
-    luminance = lax.stop_gradient(jnp.maximum(y, 0)) * counted
-    level = luminance.sum() / (3 * counted.sum())
-    unit = jnp.where(level > 0, 1 / jnp.where(level > 0, level, 1), 1)
+    if level is None:
+        radiance = lax.stop_gradient(jnp.maximum(x, 0)) * counted
+        level = radiance.sum() / (3 * counted.sum())
+    # A power of two rounds nothing, so that an image's tiles see its very features.
+    unit = jnp.ldexp(jnp.ones_like(level), -jnp.frexp(level)[1])
     x, y, variance, divergence = unit * x, unit * y, unit**2 * variance, unit**2 * divergence
 
     brightness = mean(jnp.maximum(y, 0).mean(-1, keepdims=True), 15)

@@ -1,0 +1,164 @@
+"""Frames computed window by window, on the host's buffers, into images on the host."""
+
+from typing import Any, NamedTuple, cast
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from progden_jax import memory, skipping, tiling
+from progden_jax.frame import Frame
+from progden_jax.skipping import Skip, Skipped
+from progden_jax.survey import BUFFERS, Survey, crop, exposure_of, frame_of, survey
+from progden_jax.tiling import Window
+
+
+class Place(NamedTuple):
+    """Where a window lies in its frame, and what it must know of the whole; all may be traced.
+
+    Attributes
+    ----------
+    origin : row and column of its first pixel.
+    core : first row, end row, first column, end column of what counts in it.
+    mean_variance, level : over the frame, level that of the radiance.
+    exposure : of the frame, as the denoiser has it.
+    """
+
+    origin: tuple[Any, Any]
+    core: tuple[Any, Any, Any, Any]
+    mean_variance: Any
+    level: Any
+    exposure: Any
+
+
+def fits(job: Any, frame: Frame, canvas: tuple[int, int], max_memory: int) -> bool:
+    """Whether the frame can be computed at once, as far as can be told without compiling."""
+    needed = memory.guess(job.denoiser, job.method) + _pixel_bytes(frame) * len(job.outputs)
+    return canvas[0] * canvas[1] * needed * memory.SLACK <= max_memory
+
+
+def _pixel_bytes(frame: Frame) -> int:
+    return 3 * frame.color.dtype.itemsize
+
+
+def within(
+    job: Any,
+    frame: Frame,
+    divergence: Array | None,
+    skip: Skip | None,
+    max_memory: int,
+    *,
+    reach: int,
+) -> Any:
+    """The job on a frame of any size, in windows of one shape, as large as the memory allows."""
+    step = job.denoiser.alignment
+    pixels = frame.size[0] * frame.size[1]
+    kept = _pixel_bytes(frame) * pixels * len(job.outputs)
+    edge = memory.window_edge(
+        max_memory - kept,
+        tiling.smallest_window(reach, step),
+        lambda edge: _compiled(job, frame, divergence, edge),
+        memory.guess(job.denoiser, job.method),
+    )
+    windows = list(tiling.grid(frame.size, (edge, edge), reach, step))
+    return assemble(job, frame, divergence, windows, skip, on_host=True)
+
+
+def assemble(
+    job: Any,
+    frame: Frame,
+    divergence: Array | None,
+    windows: list[Window],
+    skip: Skip | None,
+    *,
+    on_host: bool = False,
+) -> Any:
+    """The windows' cores; what none of them holds is right already."""
+    whole = survey(frame)
+    color = whole.buffers["color"]
+    # What no window fills in is x and α = 0.
+    images = {
+        name: color.copy() if name == "image" else np.zeros_like(color) for name in job.outputs
+    }
+    exposure = exposure_of(color, job.denoiser) if windows else None
+    sums = dict.fromkeys(_MEANS, 0.0)
+    denoised, computed = 0, 0
+    for window in windows:
+        if skip is not None and not _is_noisy(whole, window, skip):
+            continue
+        found = job.program(*_arguments(job, whole, divergence, exposure, window))
+        for name, image in images.items():
+            image[window.core] = np.asarray(getattr(found, name))[window.core_inside]
+        denoised += window.core_pixels
+        computed += window.area
+        for name in sums:
+            sums[name] += window.core_pixels * float(getattr(found, name, 0.0))
+    pixels = color.shape[0] * color.shape[1]
+    given = {n: cast(Any, i) if on_host else jax.numpy.asarray(i) for n, i in images.items()}
+    return job.result(
+        given,
+        repairs=whole.repairs,
+        mean_alpha=np.float32(sums["mean_alpha"] / pixels),
+        mean_sure=np.float32(sums["mean_sure"] / max(denoised, 1)),
+        skipped=_skipped(pixels, denoised, computed, skip),
+    )
+
+
+_MEANS = ("mean_alpha", "mean_sure")
+
+
+def _is_noisy(whole: Survey, window: Window, skip: Skip) -> bool:
+    """Whether a pixel of the core, or beside it, is not right yet."""
+    near = tuple(
+        slice(max(begin - skipping.MARGIN, 0), end + skipping.MARGIN)
+        for begin, end in (window.rows, window.columns)
+    )
+    color, variance = whole.buffers["color"][near], whole.buffers["variance"][near]
+    return bool(skipping.noisy(cast(Any, color), cast(Any, variance), skip.tolerance, np).any())
+
+
+def _arguments(
+    job: Any, whole: Survey, divergence: Array | None, exposure: Any, window: Window
+) -> tuple[Any, ...]:
+    buffers = {
+        name: crop(buffer, window.origin, window.shape) for name, buffer in whole.buffers.items()
+    }
+    if divergence is not None:
+        divergence = cast(Any, crop(divergence, window.origin, window.shape))
+    valid = tuple(
+        np.int32(min(n - first, length))
+        for n, first, length in zip(whole.size, window.origin, window.shape, strict=True)
+    )
+    rows, columns = window.core_inside
+    core = tuple(np.int32(n) for n in (rows.start, rows.stop, columns.start, columns.stop))
+    origin = tuple(np.int32(n) for n in window.origin)
+    place = Place(cast(Any, origin), cast(Any, core), whole.mean_variance, whole.level, exposure)
+    return job, frame_of(buffers), divergence, valid, place
+
+
+def _compiled(job: Any, frame: Frame, divergence: Array | None, edge: int) -> Any:
+    """The program for windows of that edge, which depends on nothing else."""
+    dtype = np.dtype(frame.color.dtype)
+    zeros = {
+        name: np.zeros((edge, edge, getattr(frame, name).shape[-1]), dtype)
+        for name in BUFFERS
+        if getattr(frame, name) is not None
+    }
+    whole = Survey(zeros, cast(Any, None), dtype.type(0), dtype.type(0))
+    given = None if divergence is None else zeros["color"]
+    window = Window((0, 0), (edge, edge), (0, edge), (0, edge))
+    exposure = exposure_of(np.zeros((1, 1, 3), dtype), job.denoiser)
+    arguments = _arguments(job, whole, cast(Any, given), exposure, window)
+    return job.program.lower(*arguments).compile()
+
+
+def _skipped(pixels: int, denoised: int, computed: int, skip: Skip | None) -> Skipped:
+    left = pixels - denoised
+    if not left or skip is None:
+        return Skipped(0, computed)
+    what = "every pixel" if left == pixels else f"{left / pixels:.0%} of the pixels, in whole tiles"
+    reason = (
+        f"{what}: the standard error is at most {skip.tolerance:g} of the radiance, there and "
+        f"{skipping.MARGIN} pixels around"
+    )
+    return Skipped(left, computed, reason)

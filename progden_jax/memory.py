@@ -1,0 +1,108 @@
+"""How large a window may be for the memory that is given."""
+
+import functools
+import math
+import re
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+from progden_jax import tiling
+
+UNITS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "ki": 2**10, "mi": 2**20, "gi": 2**30}
+
+SLACK = 1.15
+"""For what XLA's count of temporaries does not have: scratch inside convolutions, copies of windows."""
+
+
+def parse_size(text: str) -> int:
+    """Bytes from a number with a unit: "4GiB", "500 MB", "2e9".
+
+    Raises
+    ------
+    ValueError
+        If it is no such size, or not above 0.
+    """
+    match = re.fullmatch(r"\s*([0-9.]+(?:e\+?[0-9]+)?)\s*([kmg]i?)?b?\s*", text.lower())
+    try:
+        size = 0 if match is None else int(float(match[1]) * UNITS[match[2] or ""])
+    except ValueError:
+        size = 0
+    if size <= 0:
+        raise ValueError(
+            f"the size is {text!r}, expected bytes as a number with a unit, such as 4GiB or 500MB."
+        )
+    return size
+
+
+def shown(size: float) -> str:
+    """Bytes for people."""
+    for unit, name in ((2**30, "GiB"), (2**20, "MiB"), (2**10, "KiB")):
+        if size >= unit:
+            return f"{size / unit:.3g} {name}"
+    return f"{size:.0f} bytes"
+
+
+def window_edge(
+    available: float,
+    smallest: int,
+    needs: Callable[[int], Any],
+    guess: float,
+) -> int:
+    """The edge of the largest square window whose program fits into so many bytes.
+
+    Parameters
+    ----------
+    available : bytes for one window's program: its arguments, results and temporaries.
+    smallest : the least edge that is of use.
+    needs : the compiled program for a window of that edge, as `jax.stages.Compiled`.
+    guess : bytes per pixel to start from; too many costs speed, too few a second compilation.
+
+    Raises
+    ------
+    ValueError
+        If not even the smallest window fits.
+    """
+    edges = tiling.window_edges(smallest)
+
+    def largest(bytes_per_pixel: float) -> int:
+        fitting = [n for n in edges if n * n * bytes_per_pixel * SLACK <= available]
+        return fitting[-1] if fitting else smallest
+
+    edge = largest(guess)
+    while True:
+        per_pixel = bytes_of(needs(edge)) / edge**2
+        if edge**2 * per_pixel * SLACK <= available:
+            return edge
+        if edge == smallest:
+            least = math.ceil(edge**2 * per_pixel * SLACK)
+            raise ValueError(
+                f"max_memory leaves {shown(max(available, 0))} for a window, and the least, of "
+                f"{edge}×{edge} pixels, takes {shown(least)}: give at least "
+                f"{shown(least - available)} more, or a smaller network."
+            )
+        edge = min(largest(per_pixel), edges[edges.index(edge) - 1])
+
+
+def bytes_of(compiled: Any) -> int:
+    """What a program's arguments, results and temporaries take, as XLA counts."""
+    found = compiled.memory_analysis()
+    return found.temp_size_in_bytes + found.argument_size_in_bytes + found.output_size_in_bytes
+
+
+@functools.cache
+def _tangents_kept(probes: int) -> float:
+    return 1.0 if probes == 1 else 1.5
+
+
+def guess(denoiser: Any, method: Any) -> float:
+    """Bytes per pixel that a window's program may take, from the widest layer at full resolution."""
+    widths = [math.prod(leaf.shape[-2:-1]) + leaf.shape[-1] for leaf in _kernels(denoiser)]
+    probes = getattr(method, "probes", None) or 1
+    chunk = getattr(method, "chunk", None) or 1
+    return 4 * max(widths, default=128) * 2.3 * (_tangents_kept(probes) + (chunk - 1))
+
+
+def _kernels(denoiser: Any) -> list[Any]:
+    return [leaf for leaf in jax.tree.leaves(denoiser) if getattr(leaf, "ndim", 0) == 4]

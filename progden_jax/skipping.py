@@ -1,0 +1,93 @@
+"""What a frame does not need: which of its tiles are right already."""
+
+import dataclasses
+import functools
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+MARGIN = 5
+"""Pixels around a tile that must be right too: the reach of the t-bound's window."""
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class Skip:
+    """When a tile of a render counts as right already, so that it is given back as it is.
+
+    That is where every pixel of it, and of the 5 around it, has a standard error of at most `tolerance` times
+    its radiance, in each channel. At the default the answer without skipping is the same to 1e-5 of the
+    image's size (RMS): the t-bound lets a mix depart from the render by a few standard errors only, but on
+    thin lines where the differences in its window happen to cancel.
+
+    Parameters
+    ----------
+    tolerance : relative standard error; 0 leaves only pixels without any variance.
+    tile : edge in pixels, at least 16.
+    """
+
+    tolerance: float = 1e-6
+    tile: int = 16
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.tolerance < float("inf"):
+            raise ValueError(
+                f"tolerance is {self.tolerance}, expected a relative error from 0 up, such as 0.01."
+            )
+        if not isinstance(self.tile, int) or self.tile < 16:
+            raise ValueError(f"tile is {self.tile!r}, expected at least 16 pixels.")
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class Skipped:
+    """What was left out of a frame's computation.
+
+    Attributes
+    ----------
+    pixels : of the frame that were right already and stayed as they are.
+    computed : pixels that the networks ran on, margins and padding included.
+    reason : why, for people; "" where nothing was skipped.
+    """
+
+    pixels: int
+    computed: int
+    reason: str = ""
+
+
+def noisy(
+    color: Float[Array, "h w 3"],
+    variance: Float[Array, "h w 3"],
+    tolerance: float | Array,
+    numpy: Any = jnp,
+) -> Bool[Array, "h w"]:
+    """Pixels that are not right yet, bad values among them; by `jax.numpy`, or NumPy if told."""
+    right = (variance <= (tolerance * color) ** 2) & numpy.isfinite(color)
+    return ~right.all(-1)
+
+
+def noisy_tiles(
+    color: Float[Array, "h w 3"], variance: Float[Array, "h w 3"], skip: Skip
+) -> Bool[np.ndarray, "rows columns"]:
+    """Tiles with a pixel that is not right yet, in them or within `MARGIN` of them."""
+    return np.asarray(_noisy_tiles(color, variance, skip.tolerance, skip.tile))
+
+
+@functools.partial(jax.jit, static_argnames="tile")
+def _noisy_tiles(color: Array, variance: Array, tolerance: float, tile: int) -> Array:
+    found = noisy(color, variance, tolerance)
+    for axis in (0, 1):
+        length = found.shape[axis]
+        tiles = math.ceil(length / tile)
+        widths = [(0, 0), (0, 0)]
+        widths[axis] = (MARGIN, tiles * tile - length + MARGIN)
+        padded = jnp.moveaxis(jnp.pad(found, widths), axis, 0)
+        # A tile is at least twice the margin wide, so that three shifts of it cover it and its margin.
+        parts = [padded[s : s + tiles * tile] for s in (0, MARGIN, 2 * MARGIN)]
+        blocks = [p.reshape(tiles, tile, -1).any(1) for p in parts]
+        found = jnp.moveaxis(blocks[0] | blocks[1] | blocks[2], 0, axis)
+    return found
