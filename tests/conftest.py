@@ -1,10 +1,13 @@
 """What many tests share: real frames, small random images, and counts of compilations."""
 
 import contextlib
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
+import code_generation
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +16,10 @@ import pytest
 import progden_jax as pd
 
 DEMO = Path(pd.__file__).parent / "data" / "demo"
+
+# XLA reads its flags when it first compiles; workers have them from the process that started them.
+if "PYTEST_XDIST_WORKER" not in os.environ:
+    code_generation.choose()
 
 
 @pytest.fixture(scope="session")
@@ -35,6 +42,20 @@ def images() -> SimpleNamespace:
 
 divergence = jax.jit(pd.divergence, static_argnames=("f", "method"))
 """Compiled whole, for functions that are no pytrees: run eagerly, each operation becomes a program."""
+
+
+def drawn(form: Any, seed: int = 0) -> Any:
+    """Weights of these shapes, kernels normal with variance 1 / fan-in, biases zero.
+
+    By NumPy: programs of `jax.random` for many layers take longest of all to compile.
+    """
+    rng = np.random.default_rng(seed)
+
+    def one(like: jax.ShapeDtypeStruct) -> np.ndarray:
+        scale = np.prod(like.shape[:-1]) ** -0.5 if len(like.shape) > 1 else 0.0
+        return (scale * rng.normal(size=like.shape)).astype(like.dtype)
+
+    return jax.tree.map(one, form)
 
 
 @contextlib.contextmanager

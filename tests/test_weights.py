@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from code_generation import as_for_users
 
 import progden_jax as pd
 from progden_jax import _safetensors, mixers
@@ -28,16 +29,25 @@ def crop(real_frame):
     return jax.tree.map(lambda a: a[40:72, 30:62], real_frame.replace(spp=None))
 
 
-def output(name: str, frame: pd.Frame) -> jax.Array:
+@pytest.fixture(scope="module")
+def mixed():
+    """α of any mixer, by one program for all of an architecture."""
+    return jax.jit(lambda mixer, *images: mixer(*images), compiler_options=as_for_users())
+
+
+def output(name: str, frame: pd.Frame, mixed) -> jax.Array:
     if not name.startswith("mixer-"):
-        run = jax.jit(lambda denoiser, frame: denoiser.bind(frame)(frame.color))
+        run = jax.jit(
+            lambda denoiser, frame: denoiser.bind(frame)(frame.color),
+            compiler_options=as_for_users(),
+        )
         return run(pd.denoisers.load(name), frame)
     x, variance = frame.color, frame.variance
     y = sum(jnp.roll(x, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)) / 9
     divergence = variance / 9
     risk = pd.sure(x, y, variance, divergence)
     mixer = pd.load_mixer(name.removeprefix("mixer-"))
-    return jax.jit(lambda mixer, *images: mixer(*images))(mixer, x, y, variance, divergence, risk)
+    return mixed(mixer, x, y, variance, divergence, risk)
 
 
 def test_every_file_is_recorded_and_found_by_name():
@@ -58,7 +68,7 @@ def test_small_and_with_its_origin(name):
 
 
 @pytest.mark.parametrize("name", sorted(FILES))
-def test_outputs_are_those_recorded(name, crop):
-    found = np.asarray(output(name, crop))
+def test_outputs_are_those_recorded(name, crop, mixed):
+    found = np.asarray(output(name, crop, mixed))
     summary = [*found.mean((0, 1)), *found[9, 21]]
     np.testing.assert_allclose(summary, RECORDED[name], rtol=1e-3, atol=1e-5)
