@@ -31,7 +31,15 @@ def convolve(inputs: Array, kernel: Array, *arguments: Any, **settings: Any) -> 
     return lax.conv_general_dilated(inputs, kernel, *arguments, **settings)
 
 
+_VECTOR = 4
+"""Eigen, which convolves on CPUs, gathers a kernel's inputs in vectors only if these divide the channels."""
+
+
 def _convolve(inputs: Array, kernel: Array, precision: Any) -> Array:
+    missing = -inputs.shape[-1] % _VECTOR
+    if missing and jax.default_backend() == "cpu":
+        inputs = jnp.pad(inputs, ((0, 0), (0, 0), (0, 0), (0, missing)))
+        kernel = jnp.pad(kernel, ((0, 0), (0, 0), (0, missing), (0, 0)))
     return lax.conv_general_dilated(
         inputs, kernel, (1, 1), "SAME", dimension_numbers=_LAYOUT, precision=precision
     )
