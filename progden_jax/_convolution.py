@@ -37,6 +37,8 @@ _VECTOR = 4
 
 def _convolve(inputs: Array, kernel: Array, precision: Any) -> Array:
     missing = -inputs.shape[-1] % _VECTOR
+    if kernel.shape[:2] == (1, 1):
+        return jnp.matmul(inputs, kernel[0, 0], precision=precision)
     if missing and jax.default_backend() == "cpu":
         inputs = jnp.pad(inputs, ((0, 0), (0, 0), (0, 0), (0, missing)))
         kernel = jnp.pad(kernel, ((0, 0), (0, 0), (0, missing), (0, 0)))
