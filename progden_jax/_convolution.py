@@ -31,7 +31,17 @@ def convolve(inputs: Array, kernel: Array, *arguments: Any, **settings: Any) -> 
     return lax.conv_general_dilated(inputs, kernel, *arguments, **settings)
 
 
+_VECTOR = 4
+"""Eigen, which convolves on CPUs, gathers a kernel's inputs in vectors only if these divide the channels."""
+
+
 def _convolve(inputs: Array, kernel: Array, precision: Any) -> Array:
+    missing = -inputs.shape[-1] % _VECTOR
+    if kernel.shape[:2] == (1, 1):
+        return jnp.matmul(inputs, kernel[0, 0], precision=precision)
+    if missing and jax.default_backend() == "cpu":
+        inputs = jnp.pad(inputs, ((0, 0), (0, 0), (0, 0), (0, missing)))
+        kernel = jnp.pad(kernel, ((0, 0), (0, 0), (0, missing), (0, 0)))
     return lax.conv_general_dilated(
         inputs, kernel, (1, 1), "SAME", dimension_numbers=_LAYOUT, precision=precision
     )
@@ -64,6 +74,78 @@ def _jvp(
         along = _by_products if jax.default_backend() == "cpu" else _convolve
         slope = slope + along(inputs, by_kernel, precision)
     return out, slope
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
+def upsampled_convolution(
+    low: Float[Array, "n h w ci"],
+    skip: Float[Array, "n 2h 2w cs"],
+    kernel: Float[Array, "3 3 ci+cs co"],
+    precision: lax.PrecisionLike = None,
+) -> Float[Array, "n 2h 2w co"]:
+    """`same_convolution` of `low`, each pixel repeated over 2×2, beside `skip`, in fewer operations.
+
+    Among repeated pixels the nine taps of an output pixel meet but four different ones. So the four output
+    pixels of each of `low`'s are one 2×2 convolution: 4 multiplications where there were 9.
+    """
+    channels = low.shape[-1]
+    weights = _folded(kernel[:, :, :channels])
+    corners = lax.conv_general_dilated(
+        low, weights, (1, 1), ((1, 1), (1, 1)), dimension_numbers=_LAYOUT, precision=precision
+    )
+    out = _interleaved(corners)
+    if skip.shape[-1]:
+        out = out + same_convolution(skip, kernel[:, :, channels:], precision)
+    return out
+
+
+@functools.partial(upsampled_convolution.defjvp, symbolic_zeros=True)
+def _upsampled_jvp(
+    precision: Any, primals: tuple[Array, Array, Array], tangents: tuple[Any, Any, Any]
+) -> tuple[Array, Array]:
+    (low, skip, kernel), (by_low, by_skip, by_kernel) = primals, tangents
+    out = upsampled_convolution(low, skip, kernel, precision)
+    slope = jnp.zeros_like(out)
+    channels = low.shape[-1]
+    if not isinstance(by_low, SymbolicZero):
+        if isinstance(by_skip, SymbolicZero):
+            skip_slope, taken = skip[..., :0], kernel[:, :, :channels]
+        else:
+            skip_slope, taken = by_skip, kernel
+        slope = slope + upsampled_convolution(by_low, skip_slope, taken, precision)
+    elif not isinstance(by_skip, SymbolicZero):
+        slope = slope + same_convolution(by_skip, kernel[:, :, channels:], precision)
+    if not isinstance(by_kernel, SymbolicZero):
+        both = jnp.concatenate([_repeated(low), skip], axis=-1)
+        slope = slope + _by_products(both, by_kernel, precision)
+    return out, slope
+
+
+def _repeated(low: Array) -> Array:
+    n, h, w, c = low.shape
+    wide = jnp.broadcast_to(low[:, :, None, :, None], (n, h, 2, w, 2, c))
+    return wide.reshape(n, 2 * h, 2 * w, c)
+
+
+def _folded(kernel: Float[Array, "3 3 ci co"]) -> Float[Array, "2 2 ci 4*co"]:
+    """The taps that meet one repeated pixel added, for the even and odd rows and columns of the output."""
+    for axis in (0, 1):
+        first, middle, last = (lax.index_in_dim(kernel, i, axis, keepdims=False) for i in range(3))
+        even = jnp.stack([first, middle + last], axis)
+        odd = jnp.stack([first + middle, last], axis)
+        kernel = jnp.stack([even, odd], axis=-2)
+    return kernel.reshape(*kernel.shape[:3], -1)
+
+
+def _interleaved(corners: Float[Array, "n h+1 w+1 4*co"]) -> Float[Array, "n 2h 2w co"]:
+    """The output pixel of odd row is of the cell below and right of the corner, and so on."""
+    n, h, w, _ = corners.shape
+    h, w = h - 1, w - 1
+    split = corners.reshape(n, h + 1, w + 1, 2, 2, -1)
+    rows = [
+        jnp.stack([split[:, i : i + h, j : j + w, i, j] for j in (0, 1)], axis=3) for i in (0, 1)
+    ]
+    return jnp.stack(rows, axis=2).reshape(n, 2 * h, 2 * w, -1)
 
 
 def _by_products(inputs: Array, kernel: Array, precision: Any) -> Array:

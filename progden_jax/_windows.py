@@ -1,6 +1,7 @@
-"""Sums, maxima and Gaussians over square windows, separable and in few passes."""
+"""Sums, maxima and Gaussians over square windows, separable and in few passes.
 
-from collections.abc import Callable
+A row's pixels and channels are one axis inside, for loops over three channels are no vectors.
+"""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -8,29 +9,28 @@ from jaxtyping import Array, Float
 
 def box_sum(values: Float[Array, "h w c"], window: int) -> Float[Array, "h w c"]:
     """Sum over window × window pixels (odd), with zeros outside the image."""
-    radius = window // 2
-    for axis in (0, 1):
-        padded = _pad(values, axis, radius, 0)
-        values = _fold(padded, axis, window, values.shape[axis], lambda a, b: a + b)
-    return values
+    flat, channels = values.reshape(len(values), -1), values.shape[-1]
+    for axis, step in ((0, 1), (1, channels)):
+        padded = _pad(flat, axis, window // 2 * step, 0)
+        flat = _fold(padded, axis, window, step, flat.shape[axis])
+    return flat.reshape(values.shape)
 
 
-def _fold(
-    padded: Array, axis: int, window: int, size: int, add: Callable[[Array, Array], Array]
-) -> Array:
-    """Sums of `window` successive entries from powers of two: about 2·log2(window) additions."""
+def _fold(padded: Array, axis: int, window: int, step: int, size: int) -> Array:
+    """Sums of `window` entries that lie `step` apart, from powers of two: about 2·log2(window) additions."""
     power, width, total, offset = padded, 1, None, 0
     while True:
         if window & width:
-            part = _slice(power, axis, offset, size)
-            total = part if total is None else add(total, part)
+            part = _slice(power, axis, offset * step, size)
+            total = part if total is None else total + part
             offset += width
         width *= 2
         if width > window:
             assert total is not None
             return total
-        length = power.shape[axis] - width // 2
-        power = add(_slice(power, axis, 0, length), _slice(power, axis, width // 2, length))
+        shift = width // 2 * step
+        length = power.shape[axis] - shift
+        power = _slice(power, axis, 0, length) + _slice(power, axis, shift, length)
 
 
 def argmax_payload(
@@ -40,21 +40,23 @@ def argmax_payload(
 
     On ties the first in raster order; never outside the image. Keys must be above -inf.
     """
-    radius = window // 2
-    for axis in (1, 0):
-        best = (_pad(keys, axis, radius, -jnp.inf), _pad(payload, axis, radius, 0))
+    shape = keys.shape
+    keys, payload = (a.reshape(len(a), -1) for a in (keys, payload))
+    for axis, step in ((1, shape[-1]), (0, 1)):
+        border = window // 2 * step
+        best = (_pad(keys, axis, border, -jnp.inf), _pad(payload, axis, border, 0))
         width, size = 1, keys.shape[axis]
         while width < window:
             # Two windows that may overlap: the maximum is idempotent and the left one wins ties.
-            step = min(width, window - width)
-            length = best[0].shape[axis] - step
+            shift = min(width, window - width)
+            length = best[0].shape[axis] - shift * step
             left = [_slice(part, axis, 0, length) for part in best]
-            right = [_slice(part, axis, step, length) for part in best]
+            right = [_slice(part, axis, shift * step, length) for part in best]
             later = right[0] > left[0]
             best = (jnp.where(later, right[0], left[0]), jnp.where(later, right[1], left[1]))
-            width += step
+            width += shift
         keys, payload = (_slice(part, axis, 0, size) for part in best)
-    return keys, payload
+    return keys.reshape(shape), payload.reshape(shape)
 
 
 def gaussian_sum(values: Float[Array, "h w"], window: int, precision: Array) -> Float[Array, "h w"]:

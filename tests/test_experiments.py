@@ -20,6 +20,7 @@ from experiments.fig14 import run as fig14
 from experiments.main_job import run as main_job
 from experiments.mc_vs_exact import run as mc_vs_exact
 from experiments.mc_vs_exact import train as mc_vs_exact_train
+from experiments.performance import run as performance
 from experiments.performance import step
 from experiments.stability import run as stability
 from experiments.table1 import run as table1
@@ -265,3 +266,20 @@ def test_step(command, tmp_path):
     (row,) = cells(printed, "multiscale")
     assert row[1] == f"{found / 1e9:.1f}"
     assert float(row[5]) > 0
+
+
+def test_performance(command, tiny, tmp_path):
+    """Without competitors: every part has a time, and the convolutions their operations."""
+    output = tmp_path / "found.csv"
+    words = ("--sizes", "64x64", "--probes", 1, "--denoiser", tiny, "--rounds", 1)
+    words += ("--against", "--error-size", "none", "--no-processes", "--output", output)
+    printed = command(performance, "--data", DEMO, "--spp", 32, *words)
+    rows = {row["part"]: row for row in _common.read_csv(output)}
+    assert list(rows) == [
+        *("forward pass", "mixer features", "mixing net", "t-bound", "divergence", "whole"),
+    ]
+    assert all(float(row["ms"]) > 0 for row in rows.values())
+    once, twice = (float(rows[part]["operations_1e9"]) for part in ("forward pass", "divergence"))
+    assert twice == 2 * once
+    assert cells(printed, "mixing net / operations, 64x64") != []
+    assert output.with_suffix(".png").stat().st_size > 10_000

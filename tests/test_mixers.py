@@ -8,7 +8,7 @@ from jax import lax
 
 import progden_jax as pd
 from progden_jax import mixers, pipeline
-from progden_jax._convolution import same_convolution
+from progden_jax._convolution import same_convolution, upsampled_convolution
 from progden_jax.cli import main
 from progden_jax.mixers import multiscale
 from progden_jax.mixing import f_act
@@ -228,35 +228,70 @@ def test_multiscale_ablations(images, tmp_path):
         mixers.build("multiscale", {"start": "half"})
 
 
+def plain_convolution(x, kernel):
+    numbers = ("NHWC", "HWIO", "NHWC")
+    return lax.conv_general_dilated(x, kernel, (1, 1), "SAME", dimension_numbers=numbers)
+
+
+def derivatives(convolution, x, kernel):
+    """Forward and reverse mode, second derivatives and batches."""
+
+    def total(x, kernel):
+        return (jnp.sin(jax.vmap(convolution, (0, None))(x, kernel)) ** 2).sum()
+
+    def along(x, kernel):
+        return jax.jvp(total, (x, kernel), (x, kernel))[1]
+
+    return jax.jit(
+        lambda: (
+            jax.grad(total, (0, 1))(x, kernel),
+            along(x, kernel),
+            jax.grad(along, (0, 1))(x, kernel),
+            jax.vmap(jax.grad(lambda x, k: convolution(x, k).sum(), 1), (0, None))(x, kernel),
+        )
+    )()
+
+
+def assert_near(found, expected):
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4), found, expected
+    )
+
+
 @pytest.mark.parametrize("channels", [3, 40])
 def test_convolution_and_its_derivatives(channels):
-    """Forward and reverse mode, second derivatives and batches, against XLA's own."""
     rng = np.random.default_rng(0)
     x = jnp.asarray(rng.normal(size=(2, 2, 6, 7, channels)), jnp.float32)
     kernel = jnp.asarray(rng.normal(size=(3, 5, channels, 2)) / channels, jnp.float32)
+    expected = derivatives(plain_convolution, x, kernel)
+    assert_near(derivatives(same_convolution, x, kernel), expected)
 
-    def plain(x, kernel):
-        numbers = ("NHWC", "HWIO", "NHWC")
-        return lax.conv_general_dilated(x, kernel, (1, 1), "SAME", dimension_numbers=numbers)
 
-    def derivatives(convolution):
-        def total(x, kernel):
-            return (jnp.sin(jax.vmap(convolution, (0, None))(x, kernel)) ** 2).sum()
+@pytest.mark.parametrize("skip", [0, 3])
+def test_upsampled_convolution_and_its_derivatives(skip):
+    """Each pixel repeated over 2×2 beside a skip of so many channels, also where one of both is constant."""
+    rng = np.random.default_rng(0)
+    low = jnp.asarray(rng.normal(size=(2, 1, 3, 4, 5)), jnp.float32)
+    fine = jnp.asarray(rng.normal(size=(2, 1, 6, 8, skip)), jnp.float32)
+    kernel = jnp.asarray(rng.normal(size=(3, 3, 5 + skip, 2)) / 5, jnp.float32)
 
-        def along(x, kernel):
-            return jax.jvp(total, (x, kernel), (x, kernel))[1]
+    def repeated(inputs, kernel):
+        low, fine = inputs
+        wide = jnp.repeat(jnp.repeat(low, 2, axis=-3), 2, axis=-2)
+        return plain_convolution(jnp.concatenate([wide, fine], -1), kernel)
 
-        return jax.jit(
-            lambda: (
-                jax.grad(total, (0, 1))(x, kernel),
-                along(x, kernel),
-                jax.grad(along, (0, 1))(x, kernel),
-                jax.vmap(jax.grad(lambda x, k: convolution(x, k).sum(), 1), (0, None))(x, kernel),
-            )
-        )()
+    def folded(inputs, kernel):
+        return upsampled_convolution(*inputs, kernel)
 
-    jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4),
-        derivatives(same_convolution),
-        derivatives(plain),
-    )
+    expected = derivatives(repeated, (low, fine), kernel)
+    assert_near(derivatives(folded, (low, fine), kernel), expected)
+    inputs = low[0], fine[0]
+    for moving in (0, 1):
+
+        def along(convolution, moving=moving):
+            def one(part):
+                return convolution((part, inputs[1]) if moving == 0 else (inputs[0], part), kernel)
+
+            return jax.jvp(one, (inputs[moving],), (inputs[moving],))
+
+        assert_near(along(folded), along(repeated))

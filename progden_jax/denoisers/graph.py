@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from progden_jax._convolution import same_convolution
+from progden_jax._convolution import same_convolution, upsampled_convolution
 from progden_jax._numeric import own_zero
 from progden_jax.denoisers.nodes import (
     Add,
@@ -211,8 +211,15 @@ def evaluate(
             case Input():
                 value = inputs
             case Conv():
-                x = jnp.concatenate([values[s] for s in node.sources], axis=-1)
-                value = _convolve(params[node.layer], x, precision)
+                first, *others = node.sources
+                if isinstance(nodes[first], Upsample) and _folds(params[node.layer], precision):
+                    low = values[sources(nodes[first])[0]]
+                    value = _convolve_upsampled(
+                        params[node.layer], low, [values[s] for s in others], precision
+                    )
+                else:
+                    x = jnp.concatenate([values[s] for s in node.sources], axis=-1)
+                    value = _convolve(params[node.layer], x, precision)
                 if index in bare:
                     extent = jnp.ones((*value.shape[:2], 1), bool)
                     kept[index] = extent if masks is None else masks[level]
@@ -264,6 +271,20 @@ def _convolve(layer: Any, x: Array, precision: Any) -> Array:
         )[0]
     else:
         value = same_convolution(x[None], kernel, precision)[0]
+    return value + layer["bias"] if "bias" in layer else value
+
+
+def _folds(layer: Any, precision: Any) -> bool:
+    """Where the upsampling joins the convolution that reads it. Untried on GPUs."""
+    square = jnp.shape(layer["kernel"])[:2] == (3, 3)
+    return square and precision != "bfloat16" and jax.default_backend() == "cpu"
+
+
+def _convolve_upsampled(layer: Any, low: Array, others: Sequence[Array], precision: Any) -> Array:
+    h, w, _ = low.shape
+    skip = jnp.concatenate(others, axis=-1) if others else jnp.zeros((2 * h, 2 * w, 0), low.dtype)
+    kernel = jnp.asarray(layer["kernel"])
+    value = upsampled_convolution(low[None], skip[None], kernel, precision)[0]
     return value + layer["bias"] if "bias" in layer else value
 
 
