@@ -7,6 +7,7 @@ the truth as samples grow (Firmino, Frisvad, Jensen 2022). Images are channels-l
 __version__ = "0.1.0"
 
 from progden_jax import denoisers, metrics, transfer
+from progden_jax.batch import denoise_batch
 from progden_jax.compilation import enable_compilation_cache
 from progden_jax.denoisers import Denoiser, FunctionDenoiser
 from progden_jax.divergence import (
@@ -52,6 +53,7 @@ __all__ = [
     "Skipped",
     "closed_form_alpha",
     "denoise",
+    "denoise_batch",
     "denoisers",
     "describe_exr",
     "divergence",

@@ -85,6 +85,7 @@ def progressive_denoise(
     outputs: Sequence[str] | None = None,
     skip: Skip | bool = True,
     max_memory: int | None = None,
+    canvas: tuple[int, int] | None = None,
 ) -> Result:
     """The mix of render and denoised image that converges to the truth as samples grow.
 
@@ -110,6 +111,8 @@ def progressive_denoise(
         windows that overlap by what the networks look at, one program for all sizes, and its images come
         as NumPy arrays. The result is the same to 1e-5, but for methods that weigh the whole frame (`Probing`
         ranks its variances): these look at each window alone.
+    canvas : height and width to compute at, at least the frame's, so that frames of several sizes share a
+        program; by default both rounded up, see `canvas_size`.
 
     Raises
     ------
@@ -147,14 +150,15 @@ def progressive_denoise(
         rule = None
     if max_memory is not None:
         _no_tracers((frame, denoiser, divergence))
-    if max_memory is not None and not _windowed.fits(job, frame, _canvas(frame), max_memory):
+    canvas = _canvas(frame, canvas)
+    if max_memory is not None and not _windowed.fits(job, frame, canvas, max_memory):
         reach = tiling.margin(denoiser, job.mixer)
         return _windowed.within(job, frame, divergence, rule, max_memory, reach=reach)
     if _traced((frame, job, divergence)):
         return job.program(job, frame, divergence)
     if rule is not None:
-        return _where_needed(job, frame, divergence, rule)
-    return _whole(job, frame, divergence)
+        return _where_needed(job, frame, divergence, rule, canvas)
+    return _whole(job, frame, divergence, canvas)
 
 
 def denoise(frame: Frame, denoiser: Denoiser, *, max_memory: int | None = None) -> Denoised:
@@ -170,7 +174,7 @@ def denoise(frame: Frame, denoiser: Denoiser, *, max_memory: int | None = None) 
         return _windowed.within(job, frame, None, None, max_memory, reach=tiling.margin(denoiser))
     if _traced((frame, denoiser)) or not _has_canvas(denoiser):
         return job.program(job, frame, None)
-    return _on_canvas(job, frame, None)
+    return _on_canvas(job, frame, None, _canvas(frame))
 
 
 Valid = tuple[Int[Array, ""], Int[Array, ""]]
@@ -312,9 +316,8 @@ def canvas_size(n: int) -> int:
     return -(-n // step) * step
 
 
-def _on_canvas(job: Any, frame: Frame, divergence: Array | None) -> Any:
+def _on_canvas(job: Any, frame: Frame, divergence: Array | None, canvas: tuple[int, int]) -> Any:
     """The job on the whole frame, padded to its canvas, and its images cropped again."""
-    canvas = _canvas(frame)
     buffers = {n: getattr(frame, n) for n in BUFFERS if getattr(frame, n) is not None}
     if canvas != frame.size:
         buffers = {name: crop(buffer, (0, 0), canvas) for name, buffer in buffers.items()}
@@ -329,10 +332,11 @@ def _on_canvas(job: Any, frame: Frame, divergence: Array | None) -> Any:
     )
 
 
-def _where_needed(job: Job, frame: Frame, divergence: Array | None, skip: Skip) -> Result:
+def _where_needed(
+    job: Job, frame: Frame, divergence: Array | None, skip: Skip, canvas: tuple[int, int]
+) -> Result:
     """The frame but for the tiles that are right already."""
     variance = cast(Array, frame.variance)
-    canvas = _canvas(frame)
     skip = dataclasses.replace(skip, tile=max(skip.tile, math.ceil(max(canvas) / _MOST_TILES)))
     active = skipping.noisy_tiles(
         crop(frame.color, (0, 0), canvas), crop(variance, (0, 0), canvas), skip
@@ -345,21 +349,27 @@ def _where_needed(job: Job, frame: Frame, divergence: Array | None, skip: Skip) 
         step = cast(Any, job.denoiser).alignment
         windows = tiling.Cover(frame.size, canvas, skip.tile, reach, step).windows(active)
     if windows is None or any(w.shape == canvas for w in windows):
-        return _whole(job, frame, divergence)
+        return _whole(job, frame, divergence, canvas)
     return _windowed.assemble(job, frame, divergence, windows, skip)
 
 
-def _whole(job: Job, frame: Frame, divergence: Array | None) -> Result:
+def _whole(job: Job, frame: Frame, divergence: Array | None, canvas: tuple[int, int]) -> Result:
     if _has_canvas(job.denoiser):
-        result = _on_canvas(job, frame, divergence)
+        result = _on_canvas(job, frame, divergence, canvas)
     else:
         result = job.program(job, frame, divergence)
     return result._replace(skipped=Skipped(0, frame.size[0] * frame.size[1]))
 
 
-def _canvas(frame: Frame) -> tuple[int, int]:
+def _canvas(frame: Frame, asked: tuple[int, int] | None = None) -> tuple[int, int]:
     height, width = frame.size
-    return canvas_size(height), canvas_size(width)
+    if asked is None:
+        return canvas_size(height), canvas_size(width)
+    if len(asked) != 2 or asked[0] < height or asked[1] < width:
+        raise ValueError(
+            f"canvas is {asked}, expected (height, width) of at least {frame.size}, the frame's."
+        )
+    return asked[0], asked[1]
 
 
 def _has_canvas(denoiser: Denoiser) -> bool:

@@ -1,7 +1,8 @@
 """One file from input to output: read, denoise, mix, measure, write."""
 
+import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,6 +12,7 @@ import numpy as np
 
 import progden_jax as pd
 from progden_jax import mixers
+from progden_jax.batch import Once, Size, canvas_of, shared_canvases
 from progden_jax.cli._compare import Scores, compare
 from progden_jax.cli._options import (
     SAVE_ALWAYS,
@@ -24,6 +26,7 @@ from progden_jax.cli._run import Failure, complain
 from progden_jax.compilation import cache_folder
 from progden_jax.divergence.running import ExactRun
 from progden_jax.exr import ExrInfo, read_exr_with_info, write_exr
+from progden_jax.exr._file import load
 from progden_jax.pipeline import OUTPUTS
 
 
@@ -38,6 +41,10 @@ class Settings:
     save: tuple[str, ...] = ()
     half: bool = False
     force: bool = False
+    shapes: Mapping[Size, Size] = field(default_factory=dict)
+    """What images are computed at, by their own canvas."""
+    first_of: Once = field(default_factory=Once)
+    """So that a program is compiled by one thread."""
 
 
 @dataclass
@@ -137,6 +144,17 @@ def process(item: Item, settings: Settings, outcome: Outcome, progress: Progress
     outcome.ok = True
 
 
+def shared_shapes(items: Sequence[Item]) -> dict[Size, Size]:
+    """Few shapes for all the images, from their headers; what cannot be read is told of in its turn."""
+    if len(items) == 1:
+        return {}
+    sizes = []
+    for item in items:
+        with contextlib.suppress(ValueError, OSError):
+            sizes += [part.size for part in load(item.input, header_only=True)]
+    return shared_canvases(sizes)
+
+
 def _with_usable_variance(frame: pd.Frame, info: ExrInfo, outcome: Outcome) -> pd.Frame:
     if frame.variance is None:
         outcome.warnings.append(
@@ -207,15 +225,21 @@ def _denoise(
         outcome.mixer = repr(mixer)
         compared = set() if item.reference is None else {"denoised"}
         names = [n for n in OUTPUTS if n in {"image", *settings.save, *compared}]
-        result = pd.progressive_denoise(
-            frame,
-            denoiser,
-            mixer=mixer,
-            key=jax.random.key(estimate.seed),
-            outputs=names,
-            skip=settings.cost.rule(),
-            max_memory=max_memory,
-            **how,
+        own = canvas_of(frame.size)
+        canvas = settings.shapes.get(own)
+        result = settings.first_of(
+            (canvas or own, outcome.denoiser, tuple(names)),
+            lambda: pd.progressive_denoise(
+                frame,
+                denoiser,
+                mixer=mixer,
+                key=jax.random.key(estimate.seed),
+                outputs=names,
+                skip=settings.cost.rule(),
+                max_memory=max_memory,
+                canvas=canvas,
+                **how,
+            ),
         )
         repairs, image = result.repairs, np.asarray(result.image)
         maps = {name: np.asarray(getattr(result, name)) for name in names if name != "image"}

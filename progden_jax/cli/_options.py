@@ -255,6 +255,11 @@ class EstimateOptions:
             except ValueError as error:
                 raise UsageError(f"--mixer: {error}") from None
 
+    @property
+    def exact(self) -> bool:
+        """Whether the divergence is to be exact, which may take an hour."""
+        return self.method is not None and not METHODS[self.method].takes_probes
+
     def build(self) -> "Method":
         """The estimator."""
         import progden_jax as pd

@@ -26,6 +26,7 @@ def plan(
     variance_from: Sequence[Path] = (),
     reference: Path | None = None,
     force: bool = False,
+    resume: bool = False,
 ) -> list[Item]:
     """What is to be read and written; the folders for it are made.
 
@@ -35,6 +36,8 @@ def plan(
     output : a file for one file, else a folder, whose files keep the names of the inputs.
     folder : whether `output` is to be a folder whatever it is called.
     variance_from, reference : files, or folders that hold files named like the inputs.
+    force : outputs may exist, and will be replaced.
+    resume : inputs whose outputs exist are left out.
 
     Raises
     ------
@@ -69,7 +72,9 @@ def plan(
         )
         for path, name in named
     ]
-    _check(items, force)
+    _check(items, force or resume)
+    if resume:
+        items = [item for item in items if not os.path.lexists(item.output)]
     _make_folders(items, output if folder else None)
     return items
 
@@ -117,7 +122,10 @@ def _check(items: list[Item], force: bool) -> None:
     existing = [item.output for item in items if os.path.lexists(item.output)]
     if existing and not force:
         more = f" (and {len(existing) - 1} more)" if len(existing) > 1 else ""
-        raise Failure(f"{existing[0]}{more} exists: pass --force to replace it. Nothing was done.")
+        raise Failure(
+            f"{existing[0]}{more} exists: pass --force to replace it, or --resume to leave it and do the "
+            "rest. Nothing was done."
+        )
 
 
 def _make_folders(items: list[Item], output: Path | None) -> None:

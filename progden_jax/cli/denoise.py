@@ -2,7 +2,8 @@
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -33,6 +34,7 @@ is denoised plainly. Nothing is replaced without --force.
 ```
 progden denoise room.exr -o clean.exr
 progden denoise frames/ -o clean/ --quality high --save alpha,sure
+progden denoise frames/ -o clean/ --resume
 progden denoise room.exr -o clean.exr --variance-from roomA.exr roomB.exr
 progden denoise huge.exr -o clean.exr --max-memory 4GiB
 ```
@@ -66,6 +68,9 @@ def denoise(
         Parameter(help="The true image, to print errors against; or a folder of such."),
     ] = None,
     force: Annotated[bool, Parameter(help="Replace outputs that exist.")] = False,
+    resume: Annotated[
+        bool, Parameter(help="Leave out inputs whose outputs exist: to go on after an interrupt.")
+    ] = False,
     json: Annotated[
         bool, Parameter(help="Print what was done as one JSON list, an object per file.")
     ] = False,
@@ -77,6 +82,8 @@ def denoise(
         options.check()
     if network.no_aux and {"albedo", "normal"} & set(saved):
         raise UsageError("--no-aux leaves albedo and normal out, and --save asks for them.")
+    if force and resume:
+        raise UsageError("--force replaces outputs that exist, and --resume keeps them: give one.")
     items = plan(
         inputs,
         Path(output),
@@ -84,16 +91,25 @@ def denoise(
         variance_from=read.variance_from or (),
         reference=reference,
         force=force,
+        resume=resume,
     )
+    if not items:
+        print_json([]) if json else print("every output exists: nothing was left to do")
+        return OK
     from progden_jax import enable_compilation_cache
-    from progden_jax.cli._job import Settings, process
+    from progden_jax.batch import AT_ONCE
+    from progden_jax.cli._job import Settings, process, shared_shapes
 
     enable_compilation_cache()
-    settings = Settings(read, network, estimate, cost, saved, half, force)
+    settings = Settings(
+        read, network, estimate, cost, saved, half, force, shapes=shared_shapes(items)
+    )
     return _run_all(
         items,
         lambda item, outcome, progress: process(item, settings, outcome, progress),
         json=json,
+        # An exact divergence reports its own progress, and takes all there is for as long as it takes.
+        at_once=1 if estimate.exact or cost.max_memory is not None else AT_ONCE,
     )
 
 
@@ -102,21 +118,44 @@ def _run_all(
     process: "Callable[[Item, Outcome, Progress], None]",
     *,
     json: bool,
+    at_once: int,
 ) -> int:
-    """Every file in turn, one that fails keeping no other; the exit status."""
+    """Every file, some at once, one that fails keeping no other; told of in order; the exit status."""
     from progden_jax.cli._job import Outcome
 
-    outcomes: list[Outcome] = []
+    outcomes = [Outcome(str(item.input), str(item.output)) for item in items]
+    at_once = min(at_once, len(items))
+
+    def attempt(item: Item, outcome: "Outcome", progress: "Progress") -> None:
+        try:
+            process(item, outcome, progress)
+        except Exception as error:
+            outcome.error = explain(error)
+
+    def each(bars: "_Bars") -> "Iterator[Outcome]":
+        """In order, as they are done; in this thread where it is one at a time, so that Ctrl-C ends it."""
+        pairs = list(zip(items, outcomes, strict=True))
+        if at_once == 1:
+            for item, outcome in pairs:
+                bars.advance(item.input.name)
+                attempt(item, outcome, bars.follow)
+                yield outcome
+            return
+        pool = ThreadPoolExecutor(at_once)
+        try:
+            futures = [pool.submit(attempt, *pair, lambda *_: None) for pair in pairs]
+            for (item, outcome), future in zip(pairs, futures, strict=True):
+                bars.advance(item.input.name)
+                future.result()
+                yield outcome
+        finally:
+            # What has begun is finished, so that whole files are left.
+            pool.shutdown(wait=True, cancel_futures=True)
+
     try:
         with _Bars(len(items)) as bars:
-            for item in items:
-                bars.advance(item.input.name)
-                outcome = Outcome(str(item.input), str(item.output))
-                outcomes.append(outcome)
-                try:
-                    process(item, outcome, bars.follow)
-                except Exception as error:
-                    outcome.error = explain(error)
+            for outcome in each(bars):
+                if outcome.error is not None:
                     complain(_about(outcome.input, outcome.error))
                 for warning in outcome.warnings:
                     complain(_about(outcome.input, f"warning: {warning}"))
@@ -124,7 +163,8 @@ def _run_all(
                     bars.show(outcome.line())
     except KeyboardInterrupt:
         outcomes = [o for o in outcomes if o.ok or o.error]
-        complain(f"{sum(o.ok for o in outcomes)} of {len(items)} files were done")
+        again = "; the same command with --resume goes on" if len(items) > 1 else ""
+        complain(f"{sum(o.ok for o in outcomes)} of {len(items)} files were done{again}")
         if json:
             print_json([asdict(o) for o in outcomes])
         raise

@@ -1,0 +1,90 @@
+"""Many frames: the same results as one by one, in order, from few programs."""
+
+import threading
+
+import jax
+import numpy as np
+import pytest
+from conftest import counting_compilations
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import progden_jax as pd
+from progden_jax import batch
+
+
+@pytest.fixture(scope="module")
+def denoiser():
+    return pd.denoisers.KPCN.init(jax.random.key(0), layers=1, width=4)
+
+
+@pytest.fixture(scope="module")
+def frames(real_frame):
+    sizes = [(40, 50), (50, 40), (33, 47), (64, 64), (20, 70), (40, 50), (64, 64)]
+    return [
+        pd.Frame(np.asarray(real_frame.color)[:h, :w], np.asarray(real_frame.variance)[:h, :w])
+        for h, w in sizes
+    ]
+
+
+def test_batched_is_single_in_order_and_few_programs(frames, denoiser):
+    with counting_compilations() as compiled:
+        found = list(pd.denoise_batch(frames, denoiser, outputs=("image", "alpha"), skip=False))
+    assert compiled.count("_progressive") <= batch.PROGRAMS, compiled
+    for frame, result in zip(frames, found, strict=True):
+        assert result.image.shape == frame.color.shape
+    for frame, result in list(zip(frames, found, strict=True))[1:3]:
+        alone = pd.progressive_denoise(frame, denoiser)
+        np.testing.assert_allclose(result.image, alone.image, rtol=1e-4, atol=1e-6)
+        assert result.denoised is None
+
+
+def test_frames_are_read_on_threads_and_only_when_needed(frames, denoiser):
+    read = []
+
+    def reader(n):
+        def call():
+            read.append((n, threading.current_thread()))
+            return frames[0]
+
+        return call
+
+    results = pd.denoise_batch((reader(n) for n in range(50)), denoiser, at_once=2)
+    first = next(results)
+    assert first.image.shape == frames[0].color.shape
+    assert all(thread is not threading.main_thread() for _, thread in read)
+    results.close()
+    assert len(read) < 10
+    assert sorted(n for n, _ in read) == list(range(len(read)))
+
+
+def test_what_a_frame_raises_comes_in_its_turn(frames, denoiser):
+    wrong = frames[1].replace(variance=None)
+    results = pd.denoise_batch([frames[0], wrong, frames[0]], denoiser)
+    next(results)
+    with pytest.raises(ValueError, match="no variance"):
+        next(results)
+    with pytest.raises(ValueError, match="at_once is 0"):
+        next(pd.denoise_batch(frames, denoiser, at_once=0))
+
+
+def test_a_canvas_must_hold_the_frame(frames, denoiser):
+    with pytest.raises(ValueError, match=r"canvas is \(48, 16\), expected .* at least \(40, 50\)"):
+        pd.progressive_denoise(frames[0], denoiser, canvas=(48, 16))
+
+
+@given(st.lists(st.tuples(st.integers(1, 3000), st.integers(1, 3000)), max_size=30))
+@settings(max_examples=50, deadline=None)
+def test_shapes_hold_their_frames_and_are_few(sizes):
+    shapes = batch.shared_canvases(sizes)
+    assert len(set(shapes.values())) <= batch.PROGRAMS
+    for size in sizes:
+        own = batch.canvas_of(size)
+        assert all(n >= m for n, m in zip(shapes[own], own, strict=True))
+
+
+def test_shapes_are_joined_where_that_pays():
+    small = [(256, 256)] * 5 + [(272, 256)] * 5
+    assert set(batch.shared_canvases(small).values()) == {(288, 256)}
+    apart = [(256, 256)] * 100 + [(1080, 1920)] * 100
+    assert len(set(batch.shared_canvases(apart).values())) == 2
