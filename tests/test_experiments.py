@@ -11,6 +11,7 @@ import jax
 import pytest
 from conftest import DEMO
 
+import progden_jax as pd
 from experiments import _common, _mixes
 from experiments.divergence import methods
 from experiments.fig2 import run as fig2
@@ -31,6 +32,7 @@ from experiments.table4 import train as table4_train
 from progden_jax import denoisers, mixers
 
 Command = Callable[..., str]
+TWO = ("--spp", 8, 32)
 
 
 @pytest.fixture
@@ -55,22 +57,31 @@ def tiny(tmp_path_factory) -> Path:
     return path
 
 
+@pytest.fixture(scope="session")
+def renders(tmp_path_factory) -> Path:
+    """The middle 48×48 pixels of the bundled series: running takes as long as compiling on the whole."""
+    folder = tmp_path_factory.mktemp("renders")
+    for path in DEMO.glob("*.exr"):
+        pd.write_exr(folder / path.name, _common.centre(pd.read_exr(path), 48))
+    return folder
+
+
 def cells(printed: str, *begin: str) -> list[list[str]]:
     """The rows of Markdown tables that begin with these cells."""
     rows = [[c.strip() for c in x.split("|")[1:-1]] for x in printed.splitlines() if "|" in x]
     return [row for row in rows if tuple(row[: len(begin)]) == begin]
 
 
-def two_scenes(folder: Path) -> Path:
-    """The bundled series under two names, for one scene must be held out of training."""
-    for path in DEMO.glob("*.exr"):
+def two_scenes(renders: Path, folder: Path) -> Path:
+    """The series under two names, for one scene must be held out of training."""
+    for path in renders.glob("*.exr"):
         for name in ("a", "b"):
             shutil.copy(path, folder / f"{name}_{path.stem.rpartition('_')[2]}.exr")
     return folder
 
 
-def test_main_job(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["run", "--data", str(DEMO), "--scenes", "1"])
+def test_main_job(monkeypatch, capsys, renders):
+    monkeypatch.setattr(sys, "argv", ["run", "--data", str(renders), "--scenes", "1"])
     main_job.main()
     printed = capsys.readouterr().out
     rows = [line.split("|")[1:-1] for line in printed.splitlines() if "| mix |" in line]
@@ -135,22 +146,19 @@ def test_methods(monkeypatch, tmp_path, capsys):
     assert capsys.readouterr().out in first
 
 
-DEMO_OPTIONS = ("--data", DEMO, "--spp", 8, 32)
-
-
-def test_table3(command):
+def test_table3(command, renders):
     words = ("--denoisers", "oidn-hdr-small", "--mixers", "oidn-hdr")
-    printed = command(table3, *DEMO_OPTIONS, *words)
+    printed = command(table3, "--data", renders, *TWO, *words)
     rows, oracle = cells(printed, "mix by oidn-hdr"), cells(printed, "oracle")
     assert len(rows) == len(oracle) == 3
     assert all(float(row[2]) < 1 for row in rows)
     assert all(float(row[i]) < 1 for row in oracle for i in (1, 2))
 
 
-def test_tables_1_and_2(command, tiny):
+def test_tables_1_and_2(command, renders, tiny):
     """A denoiser that is not there is skipped by name; one without a mixer gets the closed form."""
     words = ("--denoisers", "unet-nowhere", tiny)
-    printed = command(table1, *DEMO_OPTIONS, *words)
+    printed = command(table1, "--data", renders, *TWO, *words)
     assert "skipped unet-nowhere: neither a file nor one of oidn-hdr" in printed
     (den,) = cells(printed, f"{tiny} (ClosedForm(window=15, confidence=0.7))", "den")
     mix, closed, oracle = (cells(printed, "", m)[0] for m in ("pro-den", "closed form", "oracle"))
@@ -159,12 +167,12 @@ def test_tables_1_and_2(command, tiny):
     assert den[5] == "0.0%"
     assert oracle[5] == "100.0%"
     with pytest.raises(SystemExit, match="no denoiser to measure"):
-        command(table2, *DEMO_OPTIONS, "--denoisers", "nowhere.safetensors")
+        command(table2, "--data", renders, *TWO, "--denoisers", "nowhere.safetensors")
 
 
-def test_table4(command, tiny, tmp_path):
+def test_table4(command, renders, tiny, tmp_path):
     """An ablation trained for one step stands beside the whole method; what is missing is named."""
-    data, runs = two_scenes(tmp_path), tmp_path / "runs"
+    data, runs = two_scenes(renders, tmp_path), tmp_path / "runs"
     few = ("steps=1", "batch=2", "crop=16", "spp=[8]", f"denoiser={tiny}", "exposure_stops=0.0")
     words = ("--data", data, "--output", runs, "--set", *few, "--only", "paper-ratio")
     assert "paper-ratio: step 1, score" in command(table4_train, *words)
@@ -173,7 +181,7 @@ def test_table4(command, tiny, tmp_path):
     (runs / "paper").mkdir()
     said = {"config": '{"steps": 7}', "steps": "7", "score": "1", "commit": "0"}
     mixers.save_mixer(runs / "paper" / "weights.safetensors", mixer, **said)
-    words = ("--data", DEMO, "--spp", 32, "--denoiser", tiny, "--runs", runs)
+    words = ("--data", renders, "--spp", 32, "--denoiser", tiny, "--runs", runs)
     printed = command(table4, *words)
     assert "no weights of paper-sure, paper-swap, multiscale" in printed
     assert cells(printed, "paper, without f_act")[0][1] == "1 of 1"
@@ -196,24 +204,24 @@ def test_fig2(command, tiny, tmp_path):
     assert (tmp_path / "found-tiny.png").stat().st_size > 10_000
 
 
-def test_fig10(command, tiny, tmp_path):
+def test_fig10(command, renders, tiny, tmp_path):
     output = tmp_path / "found.csv"
     words = ("--denoisers", tiny, "--output", output)
-    printed = command(fig10, *DEMO_OPTIONS, *words)
+    printed = command(fig10, "--data", renders, *TWO, *words)
     (render,) = cells(printed, "RMSE", "render")
     assert float(render[3]) < float(render[2])
     assert len(_common.read_csv(output)) == 10
     assert output.with_suffix(".png").stat().st_size > 10_000
 
 
-def test_fig12(command, tiny, tmp_path, monkeypatch):
+def test_fig12(command, renders, tiny, tmp_path, monkeypatch):
     """Every window, with and without shift, gives another image."""
     monkeypatch.setattr(fig12, "WINDOWS", (3, 11))
     bounds = [fig12.Bound(window, shift) for shift in (True, False) for window in (3, 11)]
     monkeypatch.setattr(fig12, "BOUNDS", bounds)
     output = tmp_path / "found.csv"
     words = ("--denoiser", tiny, "--mixer", "closed-form", "--output", output)
-    printed = command(fig12, "--data", DEMO, "--spp", 32, *words)
+    printed = command(fig12, "--data", renders, "--spp", 32, *words)
     assert len(cells(printed, "11×11, no shift")) == 3
     found = {row["image"]: row["RMSE"] for row in _common.read_csv(output)}
     assert len({found[name] for name in ("not bounded", *map(fig12.name, bounds))}) == 5
@@ -221,10 +229,10 @@ def test_fig12(command, tiny, tmp_path, monkeypatch):
         assert (tmp_path / name).stat().st_size > 10_000
 
 
-def test_fig14(command, tiny, tmp_path):
+def test_fig14(command, renders, tiny, tmp_path):
     output = tmp_path / "found.csv"
     words = ("--denoiser", tiny, "--output", output)
-    printed = command(fig14, *DEMO_OPTIONS, *words)
+    printed = command(fig14, "--data", renders, *TWO, *words)
     assert cells(printed, "proc2004") != []
     assert 0 < float(cells(printed, "8", "mix")[0][5]) < 1
     assert {row["spp"] for row in _common.read_csv(output)} == {"8", "32"}
@@ -232,10 +240,10 @@ def test_fig14(command, tiny, tmp_path):
         assert (tmp_path / name).stat().st_size > 10_000
 
 
-def test_mc_vs_exact(command, tiny, tmp_path, monkeypatch):
+def test_mc_vs_exact(command, renders, tiny, tmp_path, monkeypatch):
     """On crops of 16 pixels: probes change the image a little, and a second run has nothing to do."""
     output, runs = tmp_path / "found.csv", tmp_path / "runs"
-    data = two_scenes(tmp_path)
+    data = two_scenes(renders, tmp_path)
     monkeypatch.setenv("PROGDEN_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(mc_vs_exact_train, "METHODS", {"exact": mc_vs_exact_train.METHODS["exact"]})
     compared = {name: (mc_vs_exact.INFERENCE[name][0], 1) for name in ("exact", "1 probe")}
@@ -255,13 +263,20 @@ def test_mc_vs_exact(command, tiny, tmp_path, monkeypatch):
     assert _common.read_csv(output) == rows
 
 
-def test_step(command, tmp_path):
+def test_step(command, renders, tmp_path):
     """Of a batch of two 16×16: 54→32 1×1, then four 32→32 and one 32→3 3×3; all but the first thrice."""
     net = mixers.build("multiscale")
     first, rest = 54 * 32, 9 * 32 * (4 * 32 + 3)
     found = step.operations(jax.jit(net.init)(jax.random.key(0)), 512)
     assert found == 2 * 512 * (2 * first + 3 * rest)
-    words = ("--data", two_scenes(tmp_path), "--scenes", 2, "--architectures", "multiscale")
+    words = (
+        "--data",
+        two_scenes(renders, tmp_path),
+        "--scenes",
+        2,
+        "--architectures",
+        "multiscale",
+    )
     printed = command(step, *words, "--batch", 2, "--crop", 16, "--repeats", 1, "--channels", 8)
     (row,) = cells(printed, "multiscale")
     assert row[1] == f"{found / 1e9:.1f}"

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import drawn
 from jax import lax
 
 import progden_jax as pd
@@ -29,10 +30,22 @@ def either(request, mixer) -> pd.NetworkMixer:
     if request.param == "paper":
         return mixer
     architecture = mixers.build("multiscale", {"width": 4, "blocks": 1})
-    params = jax.jit(architecture.init)(jax.random.key(1))
+    return pd.NetworkMixer(noisy(drawn(form(architecture)), 0.2), architecture)
+
+
+def form(architecture):
+    return jax.eval_shape(architecture.init, jax.random.key(0))
+
+
+def fresh(architecture):
+    """Weights as `init` gives them in the last layer, the one that matters for how a mixer begins."""
+    last = jax.jit(lambda key: architecture.init(key)["conv_out"])(jax.random.key(0))
+    return {**drawn(form(architecture)), "conv_out": last}
+
+
+def noisy(params, spread):
     rng = np.random.default_rng(1)
-    params = jax.tree.map(lambda p: np.float32(p + 0.2 * rng.normal(size=p.shape)), params)
-    return pd.NetworkMixer(params, architecture)
+    return jax.tree.map(lambda p: np.float32(p + spread * rng.normal(size=p.shape)), params)
 
 
 def test_weights_round_trip(mixer, tmp_path, images):
@@ -155,7 +168,10 @@ def test_activation_has_a_gradient_at_the_start(images):
 
 
 def test_multiscale_starts_as_the_closed_form(images):
-    """And follows neither exposure nor the order of colours; its gradients are finite where nothing is."""
+    """And follows neither exposure nor the order of colours; its gradients are finite where nothing is.
+
+    In batches of two, so that one program does it all.
+    """
     architecture = mixers.build("multiscale", {"width": 3, "blocks": 1})
     known = (images.x, images.y, images.variance, images.divergence)
 
@@ -167,37 +183,38 @@ def test_multiscale_starts_as_the_closed_form(images):
 
         return jax.grad(total, (0, 1, 2, 3), has_aux=True)(params, x, y, variance, divergence)
 
-    params = jax.jit(architecture.init)(jax.random.key(0))
-    _, alpha = run(params, *known)
-    closed = np.clip(pd.closed_form_alpha(*known, window=15), 0.01, 0.99)
-    np.testing.assert_allclose(alpha, closed, rtol=1e-3)
-    batch = jax.jit(architecture.apply)(params, *(np.stack([k, 2 * k]) for k in known), 0.0)
-    np.testing.assert_allclose(batch[0], alpha, rtol=1e-5)
-
-    rng = np.random.default_rng(2)
-    params = jax.tree.map(lambda p: np.float32(p + 0.3 * rng.normal(size=p.shape)), params)
-    _, alpha = run(params, *known)
-    assert np.abs(alpha - closed).max() > 0.1
-    for scale in (1e-3, 1e4):
+    def scaled(scale):
         x, y, variance, divergence = known
-        scaled = (scale * x, scale * y, scale**2 * variance, scale**2 * divergence)
-        _, found = run(params, *(np.float32(k) for k in scaled))
-        np.testing.assert_allclose(found, alpha, rtol=1e-3, atol=1e-4)
-    for nothing in (np.zeros_like(images.x), np.full_like(images.x, 1e6)):
-        zero = np.zeros_like(nothing)
-        gradients, alpha = run(params, nothing, nothing, zero, zero)
-        assert all(np.isfinite(g).all() for g in jax.tree.leaves(gradients))
-        np.testing.assert_array_equal(alpha, 0)
+        return (scale * x, scale * y, scale**2 * variance, scale**2 * divergence)
+
+    def both(*pairs):
+        return [np.stack(pair).astype(np.float32) for pair in zip(*pairs, strict=True)]
+
+    params = fresh(architecture)
+    closed = np.clip(pd.closed_form_alpha(*known, window=15), 0.01, 0.99)
+    _, alphas = run(params, *both(known, [2 * k for k in known]))
+    np.testing.assert_allclose(alphas[0], closed, rtol=1e-3)
+
+    params = noisy(params, 0.3)
+    mixer = jax.jit(pd.NetworkMixer(params, architecture).__call__)
+    alone = mixer(*known, images.divergence)
+    assert np.abs(alone - closed).max() > 0.1
+    for scales in ((1, 1e-3), (1, 1e4)):
+        _, alphas = run(params, *both(*map(scaled, scales)))
+        np.testing.assert_allclose(alphas[0], alone, rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(alphas[1], alone, rtol=1e-3, atol=1e-4)
+    nothing = both((np.zeros_like(images.x),) * 2, (np.full_like(images.x, 1e6),) * 2)
+    zeros = np.zeros_like(nothing[0])
+    gradients, alphas = run(params, *nothing, zeros, zeros)
+    assert all(np.isfinite(g).all() for g in jax.tree.leaves(gradients))
+    np.testing.assert_array_equal(alphas, 0)
 
 
 def test_multiscale_ablations(images, tmp_path):
     """Each group hidden changes α, none the weights' shapes; without its start α begins at one half."""
     known = (images.x, images.y, images.variance, images.divergence, images.divergence)
     whole = mixers.build("multiscale", {"width": 3, "blocks": 1})
-    rng = np.random.default_rng(3)
-    params = jax.tree.map(
-        lambda p: np.float32(p + 0.3 * rng.normal(size=p.shape)), whole.init(jax.random.key(0))
-    )
+    params = noisy(drawn(form(whole)), 0.3)
     run = jax.jit(lambda mixer: mixer(*known))
     alpha = run(pd.NetworkMixer(params, whole))
     hidden = {}
@@ -220,7 +237,7 @@ def test_multiscale_ablations(images, tmp_path):
     assert zeros == {"scales": 21, "divergence": 9, "relative": 15}
 
     bare = mixers.build("multiscale", {"width": 3, "blocks": 1, "start": "none"})
-    start = np.asarray(run(pd.NetworkMixer(bare.init(jax.random.key(0)), bare)))
+    start = np.asarray(run(pd.NetworkMixer(fresh(bare), bare)))
     assert set(np.unique(start)) <= {0.0, 0.5}
     with pytest.raises(ValueError, match="without is 'colour', expected one of 'scales'"):
         mixers.build("multiscale", {"without": ["colour"]})

@@ -203,14 +203,12 @@ def test_a_firefly_does_not_drown_the_other_pixels(probes, small):
     )
     elsewhere = np.ones((32, 32), bool)
     elsewhere[17, 13] = False
-    errors = []
+    method, errors = pd.Probing(probes=probes), []
     for f, each, truth in (small, with_truth(pd.Frame(color, wild))):
-        run = jax.jit(
-            lambda key, f=f, each=each: pd.divergence(
-                f, each.color, each.variance, method=pd.Probing(probes=probes), key=key
-            )
-        )
-        found = [run(key)[elsewhere] for key in jax.random.split(jax.random.key(9), 5)]
+        found = [
+            pd.divergence(f, each.color, each.variance, method=method, key=key)[elsewhere]
+            for key in jax.random.split(jax.random.key(9), 5)
+        ]
         errors.append(np.median([relative_rmse(d, truth[elsewhere]) for d in found]))
     assert errors[1] < 3 * errors[0]
 
@@ -247,10 +245,10 @@ def test_error_of_a_tile_is_bounded_and_not_loosely(small):
     """Over keys, the variance of an image's mean is at most twice the mean of the variances / n."""
     f, frame, _ = small
     method = pd.Probing(probes=8, replicates=2)
-    run = jax.jit(
-        lambda key: pd.divergence_and_error(f, frame.color, frame.variance, method=method, key=key)
-    )
-    found = [run(key) for key in jax.random.split(jax.random.key(7), 100)]
+    found = [
+        pd.divergence_and_error(f, frame.color, frame.variance, method=method, key=key)
+        for key in jax.random.split(jax.random.key(7), 100)
+    ]
     means = np.asarray([float(d.divergence.mean()) for d in found])
     bounds = np.asarray([2 * float((d.standard_error**2).mean()) / frame.color.size for d in found])
     # 100 keys know the variance of the means to 14 %, three standard errors of it are allowed for.
