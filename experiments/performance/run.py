@@ -385,21 +385,33 @@ def main() -> None:
         if not arguments.no_processes:
             every = (OURS, *against)
             found += processes(size, made, arguments.denoiser, probes, every)
+        write(arguments.output, rows, off, found, probes)
     if arguments.error_size != "none":
         size = arguments.error_size
         off = errors(size, *scene(size), arguments.probes, TORCH in against)
+    print(write(arguments.output, rows, off, found, probes))
+
+
+def write(
+    output: Path,
+    rows: Sequence[Row],
+    off: Sequence[Error],
+    found: Sequence[Process],
+    probes: int,
+) -> str:
+    """Tables and figure of what is there so far; the tables' text."""
     for kind, ending, table in (
         (Row, "", rows),
         (Error, "-errors", off),
         (Process, "-processes", found),
     ):
         if table:
-            path = arguments.output.with_stem(arguments.output.stem + ending)
+            path = output.with_stem(output.stem + ending)
             _common.write_csv(path, kind._fields, table)
     text = tables(rows, off, found)
-    print(text)
-    _common.write_text(arguments.output.with_suffix(".md"), text)
-    _common.save_figure(arguments.output.with_suffix(".png"), figure(rows, off, probes))
+    _common.write_text(output.with_suffix(".md"), text)
+    _common.save_figure(output.with_suffix(".png"), figure(rows, off, probes))
+    return text
 
 
 if __name__ == "__main__":

@@ -167,7 +167,7 @@ def _plane(part: Part, name: str, path: str, notes: list[str]) -> np.ndarray:
         )
     if channel.dtype == "uint":
         raise ExrError(f"{path}: {name} holds whole numbers (uint32), no radiance or feature.")
-    pixels = channel.pixels.astype(np.float32)
+    pixels = channel.pixels.astype(np.float32, copy=False)
     if channel.sampling != (1, 1):
         x, y = channel.sampling
         height, width = part.size
