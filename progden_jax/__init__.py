@@ -27,6 +27,7 @@ from progden_jax.mixers import NetworkMixer
 from progden_jax.mixers import load as load_mixer
 from progden_jax.mixing import ClosedForm, Mixer, MixingNet, closed_form_alpha, mixing_features
 from progden_jax.pipeline import Denoised, Result, denoise, progressive_denoise
+from progden_jax.session import Session
 from progden_jax.skipping import Skip, Skipped
 from progden_jax.sure import sure
 from progden_jax.tstatistic import t_bound
@@ -49,6 +50,7 @@ __all__ = [
     "Probing",
     "Repairs",
     "Result",
+    "Session",
     "Skip",
     "Skipped",
     "closed_form_alpha",

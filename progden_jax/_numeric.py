@@ -1,6 +1,10 @@
-"""Functions whose derivatives stay finite, or stay cheap."""
+"""Functions whose derivatives stay finite, or stay cheap; arrays that need no copy."""
 
+import math
+
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 
@@ -17,3 +21,20 @@ def own_zero(value: Float[Array, "*shape"]) -> Float[Array, ""]:
     of zeros that every tangent pass reads again. The compiler knows that this sum of nothing is 0.
     """
     return value[:0].sum()
+
+
+_ALIGNMENT = 64
+"""Bytes; XLA on CPUs takes NumPy arrays that begin at a multiple as they are."""
+
+
+def aligned_empty(shape: tuple[int, ...]) -> np.ndarray:
+    """Uninitialised float32 that `adopted` need not copy."""
+    size = 4 * math.prod(shape)
+    memory = np.empty(size + _ALIGNMENT, np.uint8)
+    begin = -memory.ctypes.data % _ALIGNMENT
+    return memory[begin : begin + size].view(np.float32).reshape(shape)
+
+
+def adopted(array: np.ndarray) -> Array:
+    """As a JAX array, in the same memory where that can be; nobody may write to `array` any more."""
+    return jax.device_put(array, may_alias=True)

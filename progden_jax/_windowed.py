@@ -100,7 +100,7 @@ def assemble(
         repairs=whole.repairs,
         mean_alpha=np.float32(sums["mean_alpha"] / pixels),
         mean_sure=np.float32(sums["mean_sure"] / max(denoised, 1)),
-        skipped=_skipped(pixels, denoised, computed, skip),
+        skipped=what_was_skipped(pixels, denoised, computed, skip),
     )
 
 
@@ -152,7 +152,8 @@ def _compiled(job: Any, frame: Frame, divergence: Array | None, edge: int) -> An
     return job.program.lower(*arguments).compile()
 
 
-def _skipped(pixels: int, denoised: int, computed: int, skip: Skip | None) -> Skipped:
+def what_was_skipped(pixels: int, denoised: int, computed: int, skip: Skip | None) -> Skipped:
+    """In words, where of so many pixels so many were denoised."""
     left = pixels - denoised
     if not left or skip is None:
         return Skipped(0, computed)

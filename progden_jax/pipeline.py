@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
@@ -15,6 +14,7 @@ from jaxtyping import Array, Float, Int
 from progden_jax import _checks, _windowed, skipping, tiling
 from progden_jax._windowed import Place
 from progden_jax.denoisers import Denoiser
+from progden_jax.denoisers._base import passable
 from progden_jax.divergence import Method, MonteCarlo
 from progden_jax.frame import Frame, Repairs, repair
 from progden_jax.mixers import default_for
@@ -29,9 +29,6 @@ DEFAULT_METHOD = MonteCarlo(probes=1)
 
 OUTPUTS = ("image", "alpha", "denoised", "sure", "divergence")
 """Images that a `Result` can have."""
-
-_MOST_TILES = 128
-"""Along an edge, for finding the cheapest windows takes time too."""
 
 _SKIPPABLE = frozenset({"image", "alpha"})
 """Outputs that are known, x and 0, where a tile is right already."""
@@ -138,16 +135,9 @@ def progressive_denoise(
             raise ValueError(
                 f"a divergence is given and a method, {method!r}, to find it: give one of them."
             )
-    job = Job(
-        denoiser,
-        default_for(denoiser) if mixer is None else mixer,
-        jax.random.key(0) if key is None else key,
-        DEFAULT_METHOD if method is None else method,
-        _asked(outputs),
-    )
-    rule = Skip() if skip is True else skip or None
-    if not _SKIPPABLE.issuperset(job.outputs):
-        rule = None
+    job = job_of(denoiser, mixer, method, key, outputs)
+    rule = rule_of(skip, job.outputs)
+    denoiser = job.denoiser
     if max_memory is not None:
         _no_tracers((frame, denoiser, divergence))
     canvas = _canvas(frame, canvas)
@@ -167,6 +157,7 @@ def denoise(frame: Frame, denoiser: Denoiser, *, max_memory: int | None = None) 
     `max_memory` is as for `progressive_denoise`.
     """
     _checks.image("frame.color", frame.color)
+    denoiser = passable(denoiser)
     job = _PlainJob(denoiser)
     if max_memory is not None:
         _no_tracers((frame, denoiser))
@@ -206,6 +197,29 @@ class Job:
         return Result(**{name: images.get(name) for name in OUTPUTS}, **rest)
 
 
+def job_of(
+    denoiser: Denoiser,
+    mixer: Mixer | None,
+    method: Method | None,
+    key: jax.Array | None,
+    outputs: Sequence[str] | None,
+) -> Job:
+    """What the arguments of `progressive_denoise` stand for, checked."""
+    return Job(
+        passable(denoiser),
+        default_for(denoiser) if mixer is None else mixer,
+        jax.random.key(0) if key is None else key,
+        DEFAULT_METHOD if method is None else method,
+        _asked(outputs),
+    )
+
+
+def rule_of(skip: Skip | bool, outputs: Sequence[str]) -> Skip | None:
+    """Which tiles may be left out, if any: only where no output is unknown there."""
+    rule = Skip() if skip is True else skip or None
+    return rule if _SKIPPABLE.issuperset(outputs) else None
+
+
 @jax.jit
 def _progressive(
     job: Job,
@@ -214,7 +228,7 @@ def _progressive(
     valid: Valid | None = None,
     place: Place | None = None,
 ) -> Result:
-    frame, inside, repairs = _prepare(frame, valid, place)
+    frame, inside, repairs = prepare(frame, valid, place)
     x, variance = frame.color, cast(Array, frame.variance)
     f = _bind(job.denoiser, frame, valid, place)
     if divergence is None:
@@ -234,7 +248,7 @@ def _progressive(
         "sure": risk,
         "divergence": divergence,
     }
-    counted = inside if place is None else _core(frame.size, place)
+    counted = inside if place is None else core_mask(frame.size, place)
     return job.result(
         {name: images[name] for name in job.outputs},
         repairs=repairs,
@@ -268,14 +282,15 @@ def _plain(
     place: Place | None = None,
 ) -> Denoised:
     del divergence
-    frame, _, repairs = _prepare(frame, valid, place)
+    frame, _, repairs = prepare(frame, valid, place)
     image = _bind(job.denoiser, frame, valid, place)(frame.color)
     return Denoised(image, cast(Repairs, repairs))
 
 
-def _prepare(
+def prepare(
     frame: Frame, valid: Valid | None, place: Place | None
 ) -> tuple[Frame, Array | None, Repairs | None]:
+    """The frame repaired, where it is no padding, and the repairs; a window's frame is repaired already."""
     inside = None
     if valid is not None:
         rows, columns = (jnp.arange(n) < v for n, v in zip(frame.size, valid, strict=True))
@@ -295,7 +310,8 @@ def _bind(
     return denoiser.bind(frame, **known)
 
 
-def _core(size: tuple[int, int], place: Place) -> Array:
+def core_mask(size: tuple[int, int], place: Place) -> Array:
+    """(h, w, 1), true in what counts of a window of that size."""
     top, bottom, left, right = place.core
     rows, columns = (jnp.arange(n) for n in size)
     return (((rows >= top) & (rows < bottom))[:, None] & ((columns >= left) & (columns < right)))[
@@ -337,7 +353,7 @@ def _where_needed(
 ) -> Result:
     """The frame but for the tiles that are right already."""
     variance = cast(Array, frame.variance)
-    skip = dataclasses.replace(skip, tile=max(skip.tile, math.ceil(max(canvas) / _MOST_TILES)))
+    skip = skip.for_size(canvas)
     active = skipping.noisy_tiles(
         crop(frame.color, (0, 0), canvas), crop(variance, (0, 0), canvas), skip
     )

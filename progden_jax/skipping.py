@@ -13,6 +13,9 @@ from jaxtyping import Array, Bool, Float
 MARGIN = 5
 """Pixels around a tile that must be right too: the reach of the t-bound's window."""
 
+_MOST_TILES = 128
+"""Along an edge, for finding the cheapest windows takes time too."""
+
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
@@ -32,6 +35,11 @@ class Skip:
 
     tolerance: float = 1e-6
     tile: int = 16
+
+    def for_size(self, size: tuple[int, int]) -> "Skip":
+        """The same with tiles large enough for an image of that size."""
+        tile = max(self.tile, math.ceil(max(size) / _MOST_TILES))
+        return dataclasses.replace(self, tile=tile)
 
     def __post_init__(self) -> None:
         if not 0 <= self.tolerance < float("inf"):

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Iterator
-from typing import Any, Protocol, cast, runtime_checkable
+from typing import Any, Protocol, cast
 
 import numpy as np
 
@@ -22,7 +22,6 @@ frames share a program."""
 _WORTH_SPLITTING = 0.9
 
 
-@runtime_checkable
 class Tileable(Protocol):
     """A denoiser that can work on tiles of an image; all that are convolutional networks here can."""
 
@@ -80,7 +79,12 @@ class Window:
 def can_tile(denoiser: Denoiser, mixer: Mixer | None = None) -> bool:
     """Whether both tell how far they look."""
     radius = 0 if mixer is None else getattr(mixer, "receptive_radius", None)
-    return isinstance(denoiser, Tileable) and radius is not None
+    return _tells_reach(denoiser) and radius is not None
+
+
+def _tells_reach(denoiser: Denoiser) -> bool:
+    # Not isinstance, which from Python 3.12 on does not see what a wrapper passes on.
+    return all(hasattr(denoiser, name) for name in ("receptive_radius", "alignment", "exposure_of"))
 
 
 def margin(denoiser: Denoiser, mixer: Mixer | None = None) -> int:
@@ -93,19 +97,20 @@ def margin(denoiser: Denoiser, mixer: Mixer | None = None) -> int:
     ValueError
         If denoiser or mixer do not tell how far they look.
     """
-    if not isinstance(denoiser, Tileable):
+    if not _tells_reach(denoiser):
         raise ValueError(
             f"the denoiser {denoiser!r} cannot work on tiles: it has no receptive_radius, alignment and "
             "exposure_of, so leave max_memory out."
         )
+    tileable = cast(Tileable, denoiser)
     if mixer is None:
-        return denoiser.receptive_radius
+        return tileable.receptive_radius
     if not can_tile(denoiser, mixer):
         raise ValueError(
             f"the mixer {mixer!r} cannot work on tiles: give it a receptive_radius in pixels, "
             "or leave max_memory out."
         )
-    return denoiser.receptive_radius + cast(Any, mixer).receptive_radius + BOUND_RADIUS
+    return tileable.receptive_radius + cast(Any, mixer).receptive_radius + BOUND_RADIUS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,6 +125,7 @@ class Cover:
     reach : of the margin, see `margin`.
     step : multiples that windows begin at.
     shares : see `SHARES`.
+    lengths : that windows may have, by axis, instead of multiples of a share.
     """
 
     size: tuple[int, int]
@@ -128,6 +134,7 @@ class Cover:
     reach: int
     step: int
     shares: int = SHARES
+    lengths: tuple[tuple[int, ...], tuple[int, ...]] | None = None
 
     def windows(self, active: np.ndarray) -> list[Window]:
         """Windows whose cores hold all active tiles, (rows, columns) bool; disjoint.
@@ -173,7 +180,10 @@ class Cover:
         size, canvas, step = self.size[axis], self.canvas[axis], self.step
         start = max(begin - self.reach, 0) // step * step
         needed = min(end + self.reach, size) - start
-        length = _up(needed, _up(math.ceil(canvas / self.shares), step))
+        if self.lengths is None:
+            length = _up(needed, _up(math.ceil(canvas / self.shares), step))
+        else:
+            length = min((n for n in self.lengths[axis] if n >= needed), default=canvas)
         if length >= canvas:
             return 0, canvas
         return max(min(start, _up(size, step) - length), 0), length

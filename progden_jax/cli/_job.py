@@ -102,10 +102,9 @@ _REPAIRS = {
 
 
 class _Images(NamedTuple):
-    """What a run gives: `maps` are the layers that `--save` can ask for."""
+    """The result, and other images of the run by name."""
 
     image: np.ndarray
-    frame: pd.Frame
     maps: dict[str, np.ndarray]
 
 
@@ -136,8 +135,18 @@ def process(item: Item, settings: Settings, outcome: Outcome, progress: Progress
     outcome.denoiser, outcome.auxiliary = denoiser.name, denoiser.inputs
     images, checkpoint = _denoise(item, frame, denoiser, settings, outcome, progress)
     if reference is not None:
-        outcome.metrics = _measure(images, reference)
-    _write(item, images, info, settings, outcome)
+        outcome.metrics = _measure(images, frame, reference)
+    picture, layers = _chosen(images, frame, settings.save, outcome)
+    del images, frame  # while a huge image is written, no other is held
+    outcome.notes += write_exr(
+        item.output,
+        picture,
+        layers=layers,
+        like=info,
+        spp=info.spp,
+        overwrite=settings.force,
+        half=settings.half,
+    )
     if checkpoint is not None:
         checkpoint.unlink(missing_ok=True)
     outcome.seconds = round(time.perf_counter() - start, 3)
@@ -243,17 +252,15 @@ def _denoise(
         )
         repairs, image = result.repairs, np.asarray(result.image)
         maps = {name: np.asarray(getattr(result, name)) for name in names if name != "image"}
-        maps["variance"] = np.asarray(frame.variance)
         outcome.mean_alpha = float(np.asarray(result.mean_alpha))
         outcome.mean_sure = float(np.asarray(result.mean_sure))
         if result.skipped is not None:
             outcome.skipped = result.skipped.pixels / (frame.size[0] * frame.size[1])
             outcome.skipped_why = result.skipped.reason or None
-    maps["noisy"] = np.asarray(frame.color)
     outcome.repairs = {name: int(n) for name, n in repairs._asdict().items()}
     if not np.isfinite(image).all():
         raise Failure(f"{outcome.input}: the result is not finite; nothing was written.")
-    return _Images(image, frame, maps), checkpoint
+    return _Images(image, maps), checkpoint
 
 
 def _exactly(
@@ -282,12 +289,12 @@ def _exactly(
         raise
 
 
-def _measure(images: _Images, reference: np.ndarray) -> Scores:
-    noisy = images.maps["noisy"]
+def _measure(images: _Images, frame: pd.Frame, reference: np.ndarray) -> Scores:
+    noisy = np.asarray(frame.color)
     if not np.isfinite(noisy).all():
-        noisy = _repaired(images.frame)
+        noisy = _repaired(frame)
     compared = {"noisy": noisy, "denoised": images.maps["denoised"]}
-    if images.frame.variance is not None:
+    if frame.variance is not None:
         compared["mixed"] = images.image
     return compare(compared, reference)
 
@@ -296,30 +303,22 @@ _LAYERS = {"variance": "noisy_variance"}
 """Layers named otherwise than asked for: Variance would be read as that of the result."""
 
 
-def _write(
-    item: Item, images: _Images, info: ExrInfo, settings: Settings, outcome: Outcome
-) -> None:
+def _chosen(
+    images: _Images, frame: pd.Frame, save: Sequence[str], outcome: Outcome
+) -> tuple[Any, dict[str, Any]]:
+    """What to write: the image, as a frame if buffers of the input go with it, and the layers."""
+    inputs = {"noisy": frame.color, "variance": frame.variance}
     layers, buffers, missing = {}, {}, []
-    for name in settings.save:
+    for name in save:
         if name in ("albedo", "normal"):
-            buffers[name] = getattr(images.frame, name)
-            found = buffers[name] is not None
+            found = buffers[name] = getattr(frame, name)
         else:
-            found = name in images.maps
-            if found:
-                layers[_LAYERS.get(name, name)] = images.maps[name]
-        if not found:
+            found = inputs[name] if name in inputs else images.maps.get(name)
+            layers[_LAYERS.get(name, name)] = found
+        if found is None:
             missing.append(name)
     if missing:
         lack = "the file has none" if set(missing) <= set(SAVE_ALWAYS) else "there is no variance"
         outcome.warnings.append(f"not saved: {', '.join(missing)}, for {lack}")
-    image = pd.Frame(images.image, None, **buffers) if buffers else images.image
-    outcome.notes += write_exr(
-        item.output,
-        image,
-        layers=layers,
-        like=info,
-        spp=info.spp,
-        overwrite=settings.force,
-        half=settings.half,
-    )
+    picture = pd.Frame(images.image, None, **buffers) if buffers else images.image
+    return picture, {name: layer for name, layer in layers.items() if layer is not None}

@@ -1,7 +1,7 @@
 """What a denoiser is to the rest of the library."""
 
 from collections.abc import Callable
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 from jaxtyping import Array, Float
@@ -59,3 +59,34 @@ class FunctionDenoiser:
         denoiser = object.__new__(cls)
         (denoiser.function,) = children
         return denoiser
+
+
+@jax.tree_util.register_static
+class _Constant:
+    """An object that is no pytree, passed through ``jax.jit`` as a constant, told apart by identity."""
+
+    def __init__(self, denoiser: Denoiser) -> None:
+        self.denoiser = denoiser
+
+    def __call__(self, frame: Frame) -> Float[Array, "h w 3"]:
+        return self.denoiser(frame)
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "denoiser":  # not set yet, while it is copied
+            raise AttributeError(name)
+        return getattr(self.denoiser, name)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Constant) and self.denoiser is other.denoiser
+
+    def __hash__(self) -> int:
+        return id(self.denoiser)
+
+    def __repr__(self) -> str:
+        return repr(self.denoiser)
+
+
+def passable(denoiser: Denoiser) -> Any:
+    """The denoiser in a form that ``jax.jit`` takes as an argument."""
+    is_leaf = jax.tree_util.treedef_is_leaf(jax.tree.structure(denoiser))
+    return _Constant(denoiser) if is_leaf else denoiser

@@ -4,6 +4,7 @@ import logging
 from collections.abc import Sequence
 from typing import Unpack
 
+from progden_jax._numeric import adopted
 from progden_jax.exr._channels import require
 from progden_jax.exr._file import ExrError
 from progden_jax.exr._info import ExrInfo, RoleInfo, part_info, role_info
@@ -82,10 +83,19 @@ def read_exr_with_info(path: PathLike, **settings: Unpack[Settings]) -> tuple[Fr
     for role, found in render.roles.items():
         if role == "color" or (isinstance(found, Missing) and found.problem):
             require(found, role, render.path, render.parts)
+    # Pixels go as soon as they are in an image, for of a huge file there must not be two copies.
+    if render.variance_of != "second-moment":
+        render.keep_only(("color", "variance", *AUXILIARY))
     color = render.image("color")
+    if render.variance_of != "second-moment":
+        render.keep_only(("variance", *AUXILIARY))
     color, variance, text, spp = with_variance(render, color)
-    aux = {role: render.image(role) for role in AUXILIARY if isinstance(render.roles[role], Source)}
-    return Frame(color, variance, **aux, spp=spp), _info(render, text, spp, statistics=False)
+    buffers = {"color": adopted(color), "variance": None if variance is None else adopted(variance)}
+    for i, role in enumerate(AUXILIARY):
+        render.keep_only(AUXILIARY[i:])
+        if isinstance(render.roles[role], Source):
+            buffers[role] = adopted(render.image(role))
+    return Frame(**buffers, spp=spp), _info(render, text, spp, statistics=False)
 
 
 def describe_exr(path: PathLike, **settings: Unpack[Settings]) -> ExrInfo:

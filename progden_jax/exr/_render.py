@@ -1,12 +1,13 @@
 """An open file under the user's settings: which channels play which role, and their pixels."""
 
 import os
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Literal, TypedDict
 
 import numpy as np
 
+from progden_jax._numeric import aligned_empty
 from progden_jax.exr import _channels, _statistics
 from progden_jax.exr._file import ExrError, Part, holdings, load
 from progden_jax.exr._map import ChannelMap, check_roles, mapped, parse_channel_map
@@ -65,7 +66,22 @@ class Render:
         """The source's channels in float32, (H, W, count), a single one repeated."""
         part, path = self.part_of(source), source.file or self.path
         planes = [_plane(part, name, path, self.notes) for name in source.channels]
-        return np.stack(planes * (count if len(planes) == 1 else 1), axis=-1)
+        image = aligned_empty((*part.size, count))
+        for i in range(count):
+            image[..., i] = planes[i if len(planes) > 1 else 0]
+        return image
+
+    def keep_only(self, roles: Iterable[str]) -> None:
+        """Drop the pixels of all channels that none of these roles is read from."""
+        kept = [s for role in roles if isinstance(s := self.roles[role], Source)]
+        for file, parts in {None: self.parts, **self.files}.items():
+            for part in parts:
+                names = {
+                    n for s in kept if (s.file, s.part) == (file, part.index) for n in s.channels
+                }
+                for name, channel in part.channels.items():
+                    if name not in names:
+                        part.channels[name] = replace(channel, pixels=None)
 
 
 def open_render(path: PathLike, settings: Settings) -> Render:

@@ -208,13 +208,16 @@ def _like(like: PathLike | ExrInfo) -> tuple[Part, np.ndarray | None, float | No
 
 
 def _write(target: str, header: dict[str, Any], channels: dict[str, np.ndarray]) -> None:
+    """The file; `channels` is empty afterwards."""
     try:
         with replacing(target) as beside:
             with quiet():
                 OpenEXR.File(header, channels).write(os.fspath(beside))
+            names = set(channels)
+            channels.clear()  # of a huge image there must not be two copies
             # Read back whole: the library's destructors swallow what goes wrong at the end.
             written = load(beside)[0].channels
-            if written.keys() != channels.keys():
+            if written.keys() != names:
                 raise ExrError(f"what was written reads back as {', '.join(written)}")
     except (OSError, RuntimeError, ValueError, TypeError) as error:
         _fail(target, error)
