@@ -18,7 +18,6 @@ from progden_jax.divergence import Method
 from progden_jax.frame import Frame, Repairs
 from progden_jax.mixing import Mixer
 from progden_jax.pipeline import (
-    OUTPUTS,
     Job,
     Result,
     Valid,
@@ -228,8 +227,8 @@ class Session:
                 total + window.core_pixels * mean
                 for total, mean in zip((alpha, risk), means, strict=True)
             )
-        result = Result(
-            **dict.fromkeys(OUTPUTS) | images,
+        result = self._job.result(
+            images,
             repairs=survey.repairs,
             mean_alpha=alpha / pixels,
             mean_sure=risk / max(denoised, 1),
