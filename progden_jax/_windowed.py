@@ -1,5 +1,6 @@
 """Frames computed window by window, on the host's buffers, into images on the host."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple, cast
 
 import jax
@@ -7,6 +8,7 @@ import numpy as np
 from jaxtyping import Array
 
 from progden_jax import memory, skipping, tiling
+from progden_jax._devices import on_each
 from progden_jax.frame import Frame
 from progden_jax.skipping import Skip, Skipped
 from progden_jax.survey import BUFFERS, Survey, crop, exposure_of, frame_of, survey
@@ -46,22 +48,29 @@ def within(
     frame: Frame,
     divergence: Array | None,
     skip: Skip | None,
-    max_memory: int,
+    max_memory: int | None,
     *,
     reach: int,
+    devices: Sequence[Any] | None = None,
 ) -> Any:
-    """The job on a frame of any size, in windows of one shape, as large as the memory allows."""
+    """The job on a frame of any size, in windows of one shape, as large as the memory of a device allows."""
     step = job.denoiser.alignment
-    pixels = frame.size[0] * frame.size[1]
-    kept = _pixel_bytes(frame) * pixels * len(job.outputs)
-    edge = memory.window_edge(
-        max_memory - kept,
-        tiling.smallest_window(reach, step),
-        lambda edge: _compiled(job, frame, divergence, edge),
-        memory.guess(job.denoiser, job.method),
-    )
-    windows = list(tiling.grid(frame.size, (edge, edge), reach, step))
-    return assemble(job, frame, divergence, windows, skip, on_host=True)
+    shape = None
+    if devices is not None:
+        shape = tiling.shape_of_parts(frame.size, len(devices), reach, step)
+    if max_memory is not None and (shape is None or not fits(job, frame, shape, max_memory)):
+        pixels = frame.size[0] * frame.size[1]
+        kept = _pixel_bytes(frame) * pixels * len(job.outputs)
+        edge = memory.window_edge(
+            max_memory - kept,
+            tiling.smallest_window(reach, step),
+            lambda edge: _compiled(job, frame, divergence, edge),
+            memory.guess(job.denoiser, job.method),
+        )
+        shape = (edge, edge)
+    assert shape is not None
+    windows = list(tiling.grid(frame.size, shape, reach, step))
+    return assemble(job, frame, divergence, windows, skip, on_host=True, devices=devices)
 
 
 def assemble(
@@ -72,8 +81,12 @@ def assemble(
     skip: Skip | None,
     *,
     on_host: bool = False,
+    devices: Sequence[Any] | None = None,
 ) -> Any:
-    """The windows' cores; what none of them holds is right already."""
+    """The windows' cores; what none of them holds is right already.
+
+    With `devices` the windows, of one shape, are computed on all of them at once.
+    """
     whole = survey(frame)
     color = whole.buffers["color"]
     # What no window fills in is x and α = 0.
@@ -83,10 +96,14 @@ def assemble(
     exposure = exposure_of(color, job.denoiser) if windows else None
     sums = dict.fromkeys(_MEANS, 0.0)
     denoised, computed = 0, 0
-    for window in windows:
-        if skip is not None and not _is_noisy(whole, window, skip):
-            continue
-        found = job.program(*_arguments(job, whole, divergence, exposure, window))
+    if skip is not None:
+        windows = [window for window in windows if _is_noisy(whole, window, skip)]
+    calls = (_arguments(whole, divergence, exposure, window) for window in windows)
+    if devices is None:
+        results = (job.program(job, *call) for call in calls)
+    else:
+        results = on_each(job.program, job, calls, devices)
+    for window, found in zip(windows, results, strict=True):
         for name, image in images.items():
             image[window.core] = np.asarray(getattr(found, name))[window.core_inside]
         denoised += window.core_pixels
@@ -118,7 +135,7 @@ def _is_noisy(whole: Survey, window: Window, skip: Skip) -> bool:
 
 
 def _arguments(
-    job: Any, whole: Survey, divergence: Array | None, exposure: Any, window: Window
+    whole: Survey, divergence: Array | None, exposure: Any, window: Window
 ) -> tuple[Any, ...]:
     buffers = {
         name: crop(buffer, window.origin, window.shape) for name, buffer in whole.buffers.items()
@@ -133,7 +150,7 @@ def _arguments(
     core = tuple(np.int32(n) for n in (rows.start, rows.stop, columns.start, columns.stop))
     origin = tuple(np.int32(n) for n in window.origin)
     place = Place(cast(Any, origin), cast(Any, core), whole.mean_variance, whole.level, exposure)
-    return job, frame_of(buffers), divergence, valid, place
+    return frame_of(buffers), divergence, valid, place
 
 
 def _compiled(job: Any, frame: Frame, divergence: Array | None, edge: int) -> Any:
@@ -148,8 +165,8 @@ def _compiled(job: Any, frame: Frame, divergence: Array | None, edge: int) -> An
     given = None if divergence is None else zeros["color"]
     window = Window((0, 0), (edge, edge), (0, edge), (0, edge))
     exposure = exposure_of(np.zeros((1, 1, 3), dtype), job.denoiser)
-    arguments = _arguments(job, whole, cast(Any, given), exposure, window)
-    return job.program.lower(*arguments).compile()
+    arguments = _arguments(whole, cast(Any, given), exposure, window)
+    return job.program.lower(job, *arguments).compile()
 
 
 def what_was_skipped(pixels: int, denoised: int, computed: int, skip: Skip | None) -> Skipped:

@@ -9,12 +9,25 @@ from typing import Any
 import jax
 
 from progden_jax import _checks
+from progden_jax._devices import Device, on_each
 from progden_jax.denoisers import Denoiser
 from progden_jax.divergence import Method
 from progden_jax.frame import Frame
 from progden_jax.mixing import Mixer
-from progden_jax.pipeline import Result, canvas_size, progressive_denoise
-from progden_jax.skipping import Skip
+from progden_jax.pipeline import (
+    Job,
+    Result,
+    call_of,
+    canvas_size,
+    checked_variance,
+    cropped,
+    has_canvas,
+    job_of,
+    progressive_denoise,
+    rule_of,
+)
+from progden_jax.skipping import Skip, Skipped, noisy_tiles
+from progden_jax.survey import BUFFERS
 
 Size = tuple[int, int]
 
@@ -40,6 +53,7 @@ def denoise_batch(
     max_memory: int | None = None,
     sizes: Sequence[Size] | None = None,
     at_once: int = AT_ONCE,
+    devices: Sequence[Device] | None = None,
 ) -> Iterator[Result]:
     """`progressive_denoise` of every frame, in order, as they are asked for.
 
@@ -54,7 +68,10 @@ def denoise_batch(
     sizes : (height, width) of every frame, where they are known beforehand but `frames` does not tell: then
         at most three programs serve them all. Of frames in a sequence they are taken. Else every
         size has that of its canvas.
-    at_once : frames in work, and so in memory.
+    at_once : frames in work, and so in memory, per device.
+    devices : several compute a frame each at the same time, or with `max_memory` a window each of the same
+        frame. None: all of this process. In a run of several processes (``jax.distributed``) give each
+        its share of the frames, such as ``frames[jax.process_index()::jax.process_count()]``.
 
     Raises
     ------
@@ -65,15 +82,21 @@ def denoise_batch(
     if sizes is None and isinstance(frames, Sequence) and all(isinstance(f, Frame) for f in frames):
         sizes = [f.size for f in frames if isinstance(f, Frame)]
     canvases = shared_canvases(sizes or ())
+    if devices is None:
+        devices = jax.local_devices()
+    if len(devices) > 1 and max_memory is None:
+        job = job_of(denoiser, mixer, method, key, outputs)
+        read = _in_order(_read, frames, at_once * len(devices))
+        return _on_devices(read, job, rule_of(skip, job.outputs), canvases, devices)
     first_of = Once()
 
-    def run(frame: Frame | Callable[[], Frame]) -> Result:
-        read = frame if isinstance(frame, Frame) else frame()
-        canvas = canvases.get(canvas_of(read.size))
+    def run(given: Frame | Callable[[], Frame]) -> Result:
+        frame = _read(given)
+        canvas = canvases.get(canvas_of(frame.size))
 
         def call() -> Result:
             result = progressive_denoise(
-                read,
+                frame,
                 denoiser,
                 mixer=mixer,
                 method=method,
@@ -82,12 +105,60 @@ def denoise_batch(
                 skip=skip,
                 max_memory=max_memory,
                 canvas=canvas,
+                devices=devices if len(devices) > 1 else None,
             )
             return jax.block_until_ready(result)
 
-        return first_of((canvas, read.albedo is None, read.normal is None), call)
+        return first_of((canvas, frame.albedo is None, frame.normal is None), call)
 
     return _in_order(run, frames, at_once)
+
+
+def _read(frame: Frame | Callable[[], Frame]) -> Frame:
+    return frame if isinstance(frame, Frame) else frame()
+
+
+def _on_devices(
+    frames: Iterator[Frame],
+    job: Job,
+    rule: Skip | None,
+    canvases: dict[Size, Size],
+    devices: Sequence[Device],
+) -> Iterator[Result]:
+    """In order; frames of one shape wait until there is one for every device, or too many wait."""
+    groups: dict[Any, list[tuple[int, Frame, Size]]] = {}
+    done: dict[int, Result] = {}
+
+    def compute(kind: Any) -> None:
+        group = groups.pop(kind)
+        calls = (call_of(job, frame, canvas) for _, frame, canvas in group)
+        for (index, frame, canvas), found in zip(
+            group, on_each(job.program, job, calls, devices), strict=True
+        ):
+            whole = Skipped(0, canvas[0] * canvas[1])
+            done[index] = cropped(found, frame.size)._replace(skipped=whole)
+
+    following = 0
+    for index, frame in enumerate(frames):
+        variance = checked_variance(frame)
+        canvas = frame.size
+        if has_canvas(job.denoiser):
+            canvas = canvases.get(canvas_of(frame.size), canvas_of(frame.size))
+        if rule is not None and not noisy_tiles(frame.color, variance, rule).any():
+            done[index] = progressive_denoise(frame, job.denoiser, outputs=job.outputs, skip=rule)
+        else:
+            kind = (canvas, *(getattr(frame, name) is None for name in BUFFERS))
+            groups.setdefault(kind, []).append((index, frame, canvas))
+            if len(groups[kind]) == len(devices):
+                compute(kind)
+            elif sum(map(len, groups.values())) >= PROGRAMS * len(devices):
+                compute(next(iter(groups)))
+        while following in done:
+            yield done.pop(following)
+            following += 1
+    for kind in list(groups):
+        compute(kind)
+    yield from (done[index] for index in sorted(done))
 
 
 def canvas_of(size: Size) -> Size:
@@ -142,9 +213,9 @@ class Once:
         return result
 
 
-def _in_order(run: Callable[[Any], Result], items: Iterable[Any], at_once: int) -> Iterator[Result]:
+def _in_order(run: Callable[[Any], Any], items: Iterable[Any], at_once: int) -> Iterator[Any]:
     """`run` of every item on threads; what a caller does not ask for any more is not begun."""
-    pending: deque[Future[Result]] = deque()
+    pending: deque[Future[Any]] = deque()
     pool = ThreadPoolExecutor(at_once, thread_name_prefix="progden")
     try:
         for item in items:

@@ -12,6 +12,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from progden_jax import _checks, _windowed, skipping, tiling
+from progden_jax._devices import Device
 from progden_jax._windowed import Place
 from progden_jax.denoisers import Denoiser
 from progden_jax.denoisers._base import passable
@@ -83,6 +84,7 @@ def progressive_denoise(
     skip: Skip | bool = True,
     max_memory: int | None = None,
     canvas: tuple[int, int] | None = None,
+    devices: Sequence[Device] | None = None,
 ) -> Result:
     """The mix of render and denoised image that converges to the truth as samples grow.
 
@@ -110,25 +112,23 @@ def progressive_denoise(
         ranks its variances): these look at each window alone.
     canvas : height and width to compute at, at least the frame's, so that frames of several sizes share a
         program; by default both rounded up, see `canvas_size`.
+    devices : to compute on, each a window of the frame at a time, as with `max_memory`, which is then that
+        of one device. With those of several processes (``jax.devices()`` under ``jax.distributed``) every
+        process must make the same call, and gets the whole result. None: JAX's default device.
 
     Raises
     ------
     ValueError
         If the frame has no variance, is no single image, or lacks what the denoiser takes; if the
         divergence is no image of its size, or comes with a method; if an output has an unknown name; if
-        max_memory is too little for the least window, or the denoiser or mixer cannot work on tiles.
+        max_memory is too little for the least window; if the frame is to be cut, and the denoiser or mixer
+        cannot work on tiles.
 
     Notes
     -----
     Firmino et al. 2022. Cost: one denoiser pass and one tangent pass per probe, and little else.
     """
-    _checks.image("frame.color", frame.color)
-    if frame.variance is None:
-        raise ValueError(
-            "the frame has no variance, and progressive denoising needs that of the sample mean: give one, "
-            "make one from half-buffers or several seeds (read_exr's variance_from), or denoise "
-            "plainly with `denoise(frame, denoiser)`."
-        )
+    checked_variance(frame)
     if divergence is not None:
         _checks.same_shape("divergence", divergence, "frame.color", frame.color)
         if method is not None:
@@ -138,12 +138,13 @@ def progressive_denoise(
     job = job_of(denoiser, mixer, method, key, outputs)
     rule = rule_of(skip, job.outputs)
     denoiser = job.denoiser
-    if max_memory is not None:
-        _no_tracers((frame, denoiser, divergence))
     canvas = _canvas(frame, canvas)
-    if max_memory is not None and not _windowed.fits(job, frame, canvas, max_memory):
+    if _is_cut(job, frame, canvas, max_memory, devices):
+        _no_tracers((frame, denoiser, divergence))
         reach = tiling.margin(denoiser, job.mixer)
-        return _windowed.within(job, frame, divergence, rule, max_memory, reach=reach)
+        return _windowed.within(
+            job, frame, divergence, rule, max_memory, reach=reach, devices=devices
+        )
     if _traced((frame, job, divergence)):
         return job.program(job, frame, divergence)
     if rule is not None:
@@ -151,21 +152,27 @@ def progressive_denoise(
     return _whole(job, frame, divergence, canvas)
 
 
-def denoise(frame: Frame, denoiser: Denoiser, *, max_memory: int | None = None) -> Denoised:
+def denoise(
+    frame: Frame,
+    denoiser: Denoiser,
+    *,
+    max_memory: int | None = None,
+    devices: Sequence[Device] | None = None,
+) -> Denoised:
     """The denoiser alone, with bad pixels repaired: what remains to be had without a variance.
 
-    `max_memory` is as for `progressive_denoise`.
+    `max_memory` and `devices` are as for `progressive_denoise`.
     """
     _checks.image("frame.color", frame.color)
     denoiser = passable(denoiser)
     job = _PlainJob(denoiser)
-    if max_memory is not None:
+    if _is_cut(job, frame, _canvas(frame), max_memory, devices):
         _no_tracers((frame, denoiser))
-    if max_memory is not None and not _windowed.fits(job, frame, _canvas(frame), max_memory):
-        return _windowed.within(job, frame, None, None, max_memory, reach=tiling.margin(denoiser))
-    if _traced((frame, denoiser)) or not _has_canvas(denoiser):
+        reach = tiling.margin(denoiser)
+        return _windowed.within(job, frame, None, None, max_memory, reach=reach, devices=devices)
+    if _traced((frame, denoiser)):
         return job.program(job, frame, None)
-    return _on_canvas(job, frame, None, _canvas(frame))
+    return _at_once(job, frame, None, _canvas(frame))
 
 
 Valid = tuple[Int[Array, ""], Int[Array, ""]]
@@ -195,6 +202,18 @@ class Job:
     def result(images: Mapping[str, Any], **rest: Any) -> Result:
         """From the images that were asked for, and the other fields."""
         return Result(**{name: images.get(name) for name in OUTPUTS}, **rest)
+
+
+def checked_variance(frame: Frame) -> Array:
+    """That of the frame, which must be a single image that has one."""
+    _checks.image("frame.color", frame.color)
+    if frame.variance is None:
+        raise ValueError(
+            "the frame has no variance, and progressive denoising needs that of the sample mean: give one, "
+            "make one from half-buffers or several seeds (read_exr's variance_from), or denoise "
+            "plainly with `denoise(frame, denoiser)`."
+        )
+    return frame.variance
 
 
 def job_of(
@@ -332,20 +351,33 @@ def canvas_size(n: int) -> int:
     return -(-n // step) * step
 
 
-def _on_canvas(job: Any, frame: Frame, divergence: Array | None, canvas: tuple[int, int]) -> Any:
-    """The job on the whole frame, padded to its canvas, and its images cropped again."""
+def call_of(
+    job: Any, frame: Frame, canvas: tuple[int, int], divergence: Array | None = None
+) -> tuple[Any, ...]:
+    """The arguments of the job's program for a whole frame, padded to its canvas where that may be."""
+    if not has_canvas(job.denoiser):
+        return frame, divergence
     buffers = {n: getattr(frame, n) for n in BUFFERS if getattr(frame, n) is not None}
     if canvas != frame.size:
         buffers = {name: crop(buffer, (0, 0), canvas) for name, buffer in buffers.items()}
         divergence = None if divergence is None else crop(divergence, (0, 0), canvas)
-    valid = tuple(np.int32(n) for n in frame.size)
-    result = job.program(job, frame_of(buffers), divergence, valid)
-    if canvas == frame.size:
-        return result
-    height, width = frame.size
-    return jax.tree.map(
-        lambda a: jnp.asarray(np.asarray(a)[:height, :width]) if a.ndim else a, result
-    )
+    return frame_of(buffers), divergence, tuple(np.int32(n) for n in frame.size)
+
+
+def cropped(result: Any, size: tuple[int, int]) -> Any:
+    """A result with the padding around its images taken off."""
+    height, width = size
+
+    def crop(image: Any) -> Any:
+        if image.ndim < 2 or image.shape[:2] == size:
+            return image
+        return jnp.asarray(np.asarray(image)[:height, :width])
+
+    return jax.tree.map(crop, result)
+
+
+def _at_once(job: Any, frame: Frame, divergence: Array | None, canvas: tuple[int, int]) -> Any:
+    return cropped(job.program(job, *call_of(job, frame, canvas, divergence)), frame.size)
 
 
 def _where_needed(
@@ -360,7 +392,7 @@ def _where_needed(
     windows = None
     if not active.any():
         windows = []
-    elif _has_canvas(job.denoiser) and tiling.can_tile(job.denoiser, job.mixer):
+    elif has_canvas(job.denoiser) and tiling.can_tile(job.denoiser, job.mixer):
         reach = tiling.margin(job.denoiser, job.mixer)
         step = cast(Any, job.denoiser).alignment
         windows = tiling.Cover(frame.size, canvas, skip.tile, reach, step).windows(active)
@@ -370,10 +402,7 @@ def _where_needed(
 
 
 def _whole(job: Job, frame: Frame, divergence: Array | None, canvas: tuple[int, int]) -> Result:
-    if _has_canvas(job.denoiser):
-        result = _on_canvas(job, frame, divergence, canvas)
-    else:
-        result = job.program(job, frame, divergence)
+    result = _at_once(job, frame, divergence, canvas)
     return result._replace(skipped=Skipped(0, frame.size[0] * frame.size[1]))
 
 
@@ -388,7 +417,8 @@ def _canvas(frame: Frame, asked: tuple[int, int] | None = None) -> tuple[int, in
     return asked[0], asked[1]
 
 
-def _has_canvas(denoiser: Denoiser) -> bool:
+def has_canvas(denoiser: Denoiser) -> bool:
+    """Whether it takes frames padded beyond their true size."""
     return getattr(denoiser, "canvas", False)
 
 
@@ -396,11 +426,26 @@ def _traced(values: Any) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
 
 
+def _is_cut(
+    job: Any,
+    frame: Frame,
+    canvas: tuple[int, int],
+    max_memory: int | None,
+    devices: Sequence[Any] | None,
+) -> bool:
+    """Whether the frame is computed window by window."""
+    if devices is not None:
+        if not devices:
+            raise ValueError("devices is empty, expected some of jax.devices(), or None.")
+        return True
+    return max_memory is not None and not _windowed.fits(job, frame, canvas, max_memory)
+
+
 def _no_tracers(values: Any) -> None:
     if _traced(values):
         raise ValueError(
-            "max_memory is given inside jit, vmap or grad, where a frame cannot be cut into windows: "
-            "leave it out, or call from outside."
+            "max_memory or devices is given inside jit, vmap or grad, where a frame cannot be cut into "
+            "windows: leave it out, or call from outside."
         )
 
 

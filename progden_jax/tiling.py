@@ -213,6 +213,20 @@ def _along(size: int, window: int, reach: int, step: int) -> Iterator[tuple[int,
         begin = end
 
 
+def shape_of_parts(size: tuple[int, int], count: int, reach: int, step: int) -> tuple[int, int]:
+    """The least window of which a `grid` has at most so many, for as many devices."""
+
+    def length(n: int, parts: int) -> int:
+        # Each loses a margin at either end, but for the outer ones, and what aligning its start takes.
+        slack = step if parts > 1 else 0
+        return _up(math.ceil((n + 2 * (parts - 1) * reach) / parts) + slack, step)
+
+    shapes = [
+        (length(size[0], rows), length(size[1], count // rows)) for rows in range(1, count + 1)
+    ]
+    return min(shapes, key=lambda shape: shape[0] * shape[1])
+
+
 def smallest_window(reach: int, step: int) -> int:
     """The least edge that leaves a window a core."""
     return _up(2 * reach + 2 * step, step)

@@ -1,0 +1,108 @@
+"""Several devices, and several processes: the results of one."""
+
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import progden_jax as pd
+
+
+def job(shape=(150, 90)):
+    """A frame with bad pixels, partly right, and what to do with it."""
+    rng = np.random.default_rng(0)
+    color = rng.gamma(1.0, 1.0, (*shape, 3)).astype(np.float32)
+    variance = (0.1 * color).astype(np.float32)
+    variance[: 2 * shape[0] // 3] = 0
+    color[100:102, 7] = np.nan
+    network = pd.denoisers.KPCN.init(jax.random.key(0), layers=1, width=4)
+    how = {"mixer": pd.ClosedForm(window=7), "key": jax.random.key(3)}
+    return pd.Frame(color, variance), network, how
+
+
+def run(function, count, **environment):
+    """A function of this module in processes of their own, for devices are fixed when JAX starts."""
+    environment = {
+        **os.environ,
+        "JAX_PLATFORMS": "cpu",
+        "PYTHONPATH": os.pathsep.join(sys.path),
+        **environment,
+    }
+    command = [sys.executable, "-c", f"import sys, test_devices as t; t.{function}(sys.argv[1])"]
+    started = [
+        subprocess.Popen([*command, str(i)], env=environment, cwd=Path(__file__).parent)
+        for i in range(count)
+    ]
+    try:
+        assert [process.wait(timeout=300) for process in started] == [0] * count
+    finally:
+        for process in started:
+            process.kill()
+
+
+def assert_same(found, expected):
+    for name in ("image", "alpha", "denoised", "sure"):
+        image = getattr(found, name)
+        if image is not None:
+            np.testing.assert_allclose(image, getattr(expected, name), rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(found.mean_alpha, expected.mean_alpha, rtol=1e-4, atol=1e-7)
+    assert list(map(int, found.repairs)) == list(map(int, expected.repairs))
+
+
+def test_simulated_devices():
+    run("on_three_devices", 1, XLA_FLAGS="--xla_force_host_platform_device_count=3")
+
+
+def on_three_devices(_):
+    devices = jax.devices()
+    assert len(devices) == 3
+    frame, network, how = job()
+    whole = pd.progressive_denoise(frame, network, **how)
+    how["outputs"] = ("image", "alpha")
+    over = pd.progressive_denoise(frame, network, **how, devices=devices, skip=False)
+    assert_same(over, whole)
+    assert 150 * 90 < over.skipped.computed < 1.6 * 150 * 90
+    some = pd.progressive_denoise(frame, network, **how, devices=devices)
+    assert some.skipped.pixels > 0
+    np.testing.assert_allclose(some.image, whole.image, rtol=1e-5, atol=1e-5)
+
+    frames = [frame, job((145, 93))[0], frame, job((147, 90))[0]]
+    frames[2] = pd.Frame(np.nan_to_num(frame.color), np.zeros_like(frame.color))
+    batch = list(pd.denoise_batch(frames, network, **how))
+    how["outputs"] = None
+    for found, given in zip(batch, frames, strict=True):
+        assert_same(found, pd.progressive_denoise(given, network, **how))
+    assert [result.skipped.computed > 0 for result in batch] == [True, True, False, True]
+
+
+def test_processes_on_loopback():
+    """Every process has the frame and gets the whole result."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    run("in_two_processes", 2, PROGDEN_TEST_PORT=str(port), XLA_FLAGS="")
+
+
+def in_two_processes(index):
+    port = os.environ["PROGDEN_TEST_PORT"]
+    jax.distributed.initialize(f"localhost:{port}", 2, int(index))
+    assert len(jax.devices()) == 2
+    assert len(jax.local_devices()) == 1
+    frame, network, how = job()
+    over = pd.progressive_denoise(frame, network, **how, devices=jax.devices())
+    assert_same(over, pd.progressive_denoise(frame, network, **how))
+    jax.distributed.shutdown()
+
+
+def test_devices_are_checked():
+    frame, network, how = job()
+    with pytest.raises(ValueError, match="devices is empty"):
+        pd.progressive_denoise(frame, network, **how, devices=[])
+    halved = pd.FunctionDenoiser(lambda x: 0.5 * x)
+    with pytest.raises(ValueError, match="cannot work on tiles"):
+        pd.progressive_denoise(frame, halved, **how, devices=jax.devices())
