@@ -1,9 +1,13 @@
 """How large a window may be for the memory that is given."""
 
+import contextlib
+import ctypes
 import functools
 import math
+import os
 import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -44,6 +48,21 @@ def shown(size: float) -> str:
     return f"{size:.0f} bytes"
 
 
+def resident() -> int:
+    """Bytes of memory that this process holds; 0 where the system does not tell."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except (OSError, ValueError, IndexError):
+        return 0
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+def trim() -> None:
+    """Give back what was freed: a compiler leaves some hundred MB to the C library, which keeps them."""
+    with contextlib.suppress(OSError, AttributeError):  # no glibc
+        ctypes.CDLL(None).malloc_trim(0)
+
+
 def window_edge(
     available: float,
     smallest: int,
@@ -73,6 +92,7 @@ def window_edge(
     edge = largest(guess)
     while True:
         per_pixel = bytes_of(needs(edge)) / edge**2
+        trim()
         if edge**2 * per_pixel * SLACK <= available:
             return edge
         if edge == smallest:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from progden_jax._numeric import adopted
 from progden_jax.frame import Frame, Repairs, repair
 
 BUFFERS = ("color", "variance", "albedo", "normal", "depth")
@@ -96,7 +97,7 @@ _repair = jax.jit(repair)
 
 def exposure_of(color: np.ndarray, denoiser: Any) -> Any:
     """What the denoiser makes of a whole frame's repaired colour."""
-    return denoiser.exposure_of(Frame(color, None), None)
+    return denoiser.exposure_of(Frame(adopted(color), None), None)
 
 
 def crop(buffer: np.ndarray | Array, origin: tuple[int, int], shape: tuple[int, int]) -> Any:

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 import progden_jax as pd
-from progden_jax import mixers
+from progden_jax import memory, mixers
 from progden_jax.batch import Once, Size, canvas_of, shared_canvases
 from progden_jax.cli._compare import Scores, compare
 from progden_jax.cli._options import (
@@ -217,7 +217,8 @@ def _denoise(
     estimate = settings.estimate
     max_memory = settings.cost.max_bytes()
     if max_memory is not None:
-        max_memory -= sum(leaf.nbytes for leaf in jax.tree.leaves(frame))
+        frame_bytes = sum(leaf.nbytes for leaf in jax.tree.leaves(frame))
+        max_memory -= max(memory.resident(), frame_bytes)
     if frame.variance is None:
         outcome.mode = "plain"
         denoised, repairs = pd.denoise(frame, denoiser, max_memory=max_memory)

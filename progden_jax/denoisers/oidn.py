@@ -100,6 +100,10 @@ class OIDN(Network):
         return f"OIDN({self.name!r}, inputs={self.inputs}, exposure={self.exposure})"
 
 
+_BAND = 512
+"""Rows."""
+
+
 @jax.jit
 def autoexposure(color: Float[Array, "h w 3"], *, valid: Valid = None) -> Float[Array, ""]:
     """0.18 / 2^mean(log2 L) over bins of about 16×16 pixels of mean luminance L > 1e-8; 1 for a black image.
@@ -107,14 +111,28 @@ def autoexposure(color: Float[Array, "h w 3"], *, valid: Valid = None) -> Float[
     `valid` is the true (height, width), may be traced, of an image padded beyond it.
     """
     height, width = color.shape[:2] if valid is None else valid
-    sane = jnp.where((color < 0) | jnp.isnan(color), 0, color)
-    sane = jnp.minimum(sane, jnp.finfo(color.dtype).max)
     weights = jnp.asarray([0.212671, 0.715160, 0.072169], color.dtype)
-    luminance = (sane * weights).sum(-1)
     rows, row_counts = _bins(color.shape[0], height, color.dtype)
     columns, column_counts = _bins(color.shape[1], width, color.dtype)
     exact = lax.Precision.HIGHEST
-    sums = jnp.matmul(jnp.matmul(rows, luminance, precision=exact), columns.T, precision=exact)
+
+    def add_band(sums: Array, band: tuple[Array, Array]) -> tuple[Array, None]:
+        pixels, members = band
+        sane = jnp.where((pixels < 0) | jnp.isnan(pixels), 0, pixels)
+        luminance = (jnp.minimum(sane, jnp.finfo(color.dtype).max) * weights).sum(-1)
+        return sums + jnp.matmul(members.T, luminance, precision=exact), None
+
+    # In bands, for a huge frame's luminance and copies of it would take more memory than the frame.
+    sums = jnp.zeros((len(rows), color.shape[1]), color.dtype)
+    whole = color.shape[0] // _BAND * _BAND
+    if whole:
+        bands = (color[:whole], rows.T[:whole])
+        sums, _ = lax.scan(
+            add_band, sums, jax.tree.map(lambda a: a.reshape(-1, _BAND, *a.shape[1:]), bands)
+        )
+    if whole < color.shape[0]:
+        sums, _ = add_band(sums, (color[whole:], rows.T[whole:]))
+    sums = jnp.matmul(sums, columns.T, precision=exact)
     counts = row_counts[:, None] * column_counts
     means = sums / jnp.maximum(counts, 1)
     lit = (means > 1e-8) & (counts > 0)
