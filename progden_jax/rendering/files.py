@@ -25,8 +25,8 @@ from progden_jax.rendering.series import frame, grow
 ATTRIBUTE = "progdenRender"
 """In every file: all that determines its pixels, in words."""
 
-SAVE_SECONDS = 20.0
-"""At most this often, and for at most a twentieth of the time, is a checkpoint written."""
+SAVE_SECONDS, SAVE_RATIO = 20.0, 20.0
+"""A checkpoint is written after this time, and this many times what writing the last one took."""
 
 _log = logging.getLogger(__name__)
 
@@ -229,7 +229,7 @@ def _resumed(
             progress(grown.count - moments.count)
             moments = grown
             yield moments
-            if time.monotonic() - last > max(SAVE_SECONDS, 20 * cost):
+            if time.monotonic() - last > max(SAVE_SECONDS, SAVE_RATIO * cost):
                 begin = time.monotonic()
                 _save(partial, made_of, moments)
                 saved, last = moments.count, time.monotonic()

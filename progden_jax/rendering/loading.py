@@ -7,6 +7,8 @@ from typing import Any
 
 from progden_jax.rendering import _mitsuba
 
+# Nothing is loaded in parallel: emitters would come in an order of chance, and with it other samples.
+
 
 def load_scene(path: str | os.PathLike[str], parameters: Mapping[str, str] | None = None) -> Any:
     """The `mitsuba.Scene` in an XML file.
@@ -25,7 +27,7 @@ def load_scene(path: str | os.PathLike[str], parameters: Mapping[str, str] | Non
     if not Path(path).is_file():
         raise ValueError(f"{os.fspath(path)}: no such file; expected a Mitsuba scene (.xml).")
     try:
-        scene = mi.load_file(os.fspath(path), **(parameters or {}))
+        scene = mi.load_file(os.fspath(path), parallel=False, **(parameters or {}))
     except Exception as error:  # whatever kind its plugins raise
         raise ValueError(f"{os.fspath(path)}: Mitsuba cannot load it: {_text(error)}") from None
     return _checked(scene, os.fspath(path))
@@ -42,7 +44,7 @@ def loaded(scene: Any) -> Any:
     mi = _mitsuba.load()
     if isinstance(scene, dict):
         try:
-            scene = mi.load_dict(scene)
+            scene = mi.load_dict(scene, parallel=False)
         except Exception as error:
             raise ValueError(f"Mitsuba cannot load the scene: {_text(error)}") from None
     return _checked(scene, "scene")

@@ -17,11 +17,6 @@ from progden_jax.rendering.moments import AUXILIARY
 PATHS = 1 << 20
 """Paths in the largest wave; compiled variants keep some 200 bytes for each."""
 
-STREAMS = 1 << 32
-"""Random streams that the scalar variant has, one per sample of a pixel."""
-
-_OTHER = 0x9E3779B9  # keeps the two halves' streams apart, being odd, and a pixel's own from its neighbours'
-
 
 class Wave(NamedTuple):
     """The samples `start` to `start` + n of every pixel."""
@@ -80,39 +75,25 @@ class Samples:
             {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal,depth:depth"}
         )
         self._auxiliary = auxiliary
-        # Of one sensor: it brings a film and a sampler of ours to whatever sensor the scene has.
-        self._sensor = mi.load_dict(
-            {
-                "type": "batch",
-                "inner": sensors[sensor],
-                "film": {
-                    "type": "hdrfilm",
-                    "height": self.size[0],
-                    "width": self.size[1],
-                    "rfilter": {"type": "box"},
-                    "pixel_format": "rgb",
-                    "component_format": "float32",
-                },
-                "sampler": {"type": "independent", "seed": _base_seed(seed, reference)},
-            }
-        )
+        film = {
+            "type": "hdrfilm",
+            "height": self.size[0],
+            "width": self.size[1],
+            "rfilter": {"type": "box"},
+            "pixel_format": "rgb",
+            "component_format": "float32",
+        }
+        # A batch of one: it brings a film and a sampler of ours to whatever sensor the scene has.
+        self._spec = {"type": "batch", "inner": sensors[sensor], "film": mi.load_dict(film)}
+        self._sensor = self._sensor_with(seed=0)
         pixels = self.size[0] * self.size[1]
         self._largest = 1 << max(0, (PATHS // pixels).bit_length() - 1)
-        self._limit = STREAMS if _mitsuba.jit() else STREAMS // pixels
+        # Halves of one range, so that no stream of the reference is one of the series.
+        state = int(np.random.SeedSequence(seed).generate_state(1)[0])
+        self._first_stream = state + (1 << 31) * reference
 
     def waves(self, start: int, stop: int) -> Iterator[Wave]:
-        """From the wave that holds sample `start`; the last is cut short at `stop`.
-
-        Raises
-        ------
-        ValueError
-            If the variant has not so many random numbers.
-        """
-        if stop > self._limit:
-            raise ValueError(
-                f"{stop} samples per pixel are more than the {self._limit} that the scalar variant has "
-                "random numbers for at this size: take fewer, or --variant llvm_ad_rgb."
-            )
+        """From the wave that holds sample `start`; the last is cut short at `stop`."""
         trace = self._wavefront if _mitsuba.jit() else self._renders
         first, n = 0, 1
         while first < stop:
@@ -126,12 +107,15 @@ class Samples:
         import mitsuba as mi
 
         def take(integrator: Any, channels: int) -> np.ndarray:
-            one = {"sensor": self._sensor, "integrator": integrator, "spp": 1}
             images = [
-                np.array(mi.render(self._scene, seed=k, **one)) for k in range(start, start + n)
+                np.array(mi.render(self._scene, sensor=sensor, integrator=integrator, spp=1))
+                for sensor in sensors
             ]
             return np.stack(images)[..., :channels]
 
+        # The seed goes to the sampler, as `render` multiplies its own by the number of pixels: the streams
+        # of a pixel are then in a row so regular that means vary up to twice as much as they should.
+        sensors = [self._sensor_with(self._stream(k)) for k in range(start, start + n)]
         aux = take(self._aov, AUXILIARY) if self._auxiliary else None
         return Wave(start, take(self._integrator, 3), _clipped(aux))
 
@@ -146,16 +130,17 @@ class Samples:
 
         height, width = self.size
         lanes = n * height * width
-        sampler = self._sensor.sampler()
-        sampler.seed(start, lanes)
+        sensor = self._sensor  # always the same, or the kernel would be compiled again
+        sampler = sensor.sampler()
+        sampler.seed(self._stream(start), lanes)
         pixel = dr.arange(mi.UInt32, lanes) % (height * width)
         corner = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width))
         position = (corner + sampler.next_2d()) / mi.Point2f(width, height)
-        aperture = sampler.next_2d() if self._sensor.needs_aperture_sample() else mi.Point2f(0.5)
-        time = mi.Float(self._sensor.shutter_open())
-        if (open_time := self._sensor.shutter_open_time()) > 0:
+        aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+        time = mi.Float(sensor.shutter_open())
+        if (open_time := sensor.shutter_open_time()) > 0:
             time += sampler.next_1d() * open_time
-        rays, weight = self._sensor.sample_ray_differential(time, 0.0, position, aperture)
+        rays, weight = sensor.sample_ray_differential(time, 0.0, position, aperture)
         radiance, _, _ = self._integrator.sample(self._scene, sampler, rays)
         found = [*(weight * radiance)]
         if self._auxiliary:
@@ -166,6 +151,21 @@ class Samples:
         return Wave(
             start, samples[..., :3], _clipped(samples[..., 3:] if self._auxiliary else None)
         )
+
+    def _sensor_with(self, seed: int) -> Any:
+        import mitsuba as mi
+
+        return mi.load_dict(self._spec | {"sampler": {"type": "independent", "seed": seed}})
+
+    def _stream(self, k: int) -> int:
+        """The seed of sample k, or of the wave from it on: never twice the same, and without a pattern.
+
+        By the finaliser of MurmurHash3 (Appleby, public domain), a bijection of 32-bit numbers.
+        """
+        h = (self._first_stream + k) % (1 << 32)
+        for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35), (16, 1)):
+            h = (h ^ h >> shift) * factor % (1 << 32)
+        return h
 
 
 def film_size(sensor: Any) -> tuple[int, int]:
@@ -180,8 +180,3 @@ def _clipped(auxiliary: np.ndarray | None) -> np.ndarray | None:
         albedo = auxiliary[..., :3]
         np.clip(albedo, 0, 1, out=albedo)
     return auxiliary
-
-
-def _base_seed(seed: int, reference: bool) -> int:
-    state = int(np.random.SeedSequence(seed).generate_state(1)[0])
-    return (state + _OTHER * reference) % (1 << 32)

@@ -83,23 +83,21 @@ def room(rng: np.random.Generator) -> tuple[dict[str, Any], list[Shape]]:
             top = rng.uniform(-0.3, 0.3) * w, h, rng.uniform(-0.35, 0.15) * d
             found += lights.hanging(rng, flux / count, top, rng.uniform(0.3, 1.0))
     elif opening is not None:
-        sky = lights.sky(rng, sun=rng.random() < 0.6)
-        area = opening[2] * (opening[3] - opening[1])
-        sky *= flux / (area * lights.irradiance(sky, (1, 0, 0)))
-        found.append(lights.environment(sky))
+        found += _daylight(rng, flux, w, opening)
     else:
         found += _string(rng, flux, w, h, d)
     found += _furniture(rng, w, h, d)
     eye = rng.uniform(-0.35, 0.35) * w, rng.uniform(1.0, 1.7), d / 2 - 0.25
-    target = rng.uniform(-0.15, 0.15) * w, rng.uniform(0.5, 1.1), -0.25 * d
-    return _camera(rng, eye, target, fov=(48, 72), blurred=0.25), found
+    target = rng.uniform(-0.15, 0.15) * w, rng.uniform(0.45, 0.9), -0.15 * d
+    return _camera(rng, eye, target, fov=(38, 60), blurred=0.25), found
 
 
 def outdoor(rng: np.random.Generator) -> tuple[dict[str, Any], list[Shape]]:
     """Ground, buildings, trees, fences and what lies about, by day or under lamps at night."""
     night = rng.random() < 0.2
-    sky = lights.sky(rng, sun=not night and rng.random() < 0.7)
-    level = 0.25 if night else rng.uniform(2.5, 5)
+    sun = not night and rng.random() < 0.7
+    sky = lights.sky(rng, sun=sun)
+    level = 0.25 if night else rng.uniform(2, 4) if sun else rng.uniform(1, 2)
     sky *= level / lights.irradiance(sky, (0, 1, 0))
     found: list[Shape] = [lights.environment(sky)]
     found.append(
@@ -144,10 +142,12 @@ def studio(rng: np.random.Generator) -> tuple[dict[str, Any], list[Shape]]:
     x = np.linspace(-4, 4, 9)
     backdrop = np.stack([x + 0 * y[:, None], y[:, None] + 0 * x, z[:, None] + 0 * x], -1)
     found: list[Shape] = [shapes.mesh(backdrop, _at(0, 0, 0), materials.surface(rng, repeat=6))]
-    for px, pz, r in _places(rng, int(rng.integers(3, 8)), (-0.9, 0.9), (-0.9, 0.7), (0.1, 0.32)):
+    for px, pz, r in _places(
+        rng, int(rng.integers(3, 8)), (-0.65, 0.65), (-0.8, 0.7), (0.12, 0.35)
+    ):
         found += shapes.thing(rng, size=2 * r, at=_at(px, 0, pz))
     count = int(rng.integers(1, 4))
-    share = rng.uniform(1.5, 3.0) * np.pi / count  # irradiance wanted at the origin, from each
+    share = rng.uniform(0.6, 1.4) * np.pi / count  # irradiance wanted at the origin, from each
     for _ in range(count):
         lamp = np.array([rng.uniform(-2, 2), rng.uniform(1.2, 2.4), rng.uniform(-0.8, 2)])
         distance = float(np.linalg.norm(lamp))
@@ -203,10 +203,26 @@ def _walls(rng: np.random.Generator, w: float, h: float, d: float, opening: Any)
     return found
 
 
+def _daylight(rng: np.random.Generator, flux: float, w: float, opening: Any) -> list[Shape]:
+    """An overcast sky close behind the window, or a sun with a sky that gives little."""
+    z, bottom, width, top = opening
+    middle = np.array([w / 2, (bottom + top) / 2, z])
+    if rng.random() < 0.5:
+        at = _at(w / 2 + 0.15, (bottom + top) / 2, z) @ _transform().rotate([0, 0, 1], -90)
+        return [lights.panel(rng, flux, at, ((top - bottom) / 2 + 0.15, width / 2 + 0.15))]
+    toward = np.array([rng.uniform(0.7, 1), rng.uniform(0.5, 1), rng.uniform(-0.5, 0.5)])
+    toward /= np.linalg.norm(toward)
+    distance, area = 12.0, width * (top - bottom) * toward[0]
+    sun = lights.bulb(rng, flux / area * 4 * np.pi * distance**2, middle + distance * toward, 0.12)
+    sky = lights.sky(rng, sun=False)
+    level = rng.uniform(0.1, 0.25) * flux / (width * (top - bottom))
+    return [sun, lights.environment(sky * (level / lights.irradiance(sky, (1, 0, 0))))]
+
+
 def _furniture(rng: np.random.Generator, w: float, h: float, d: float) -> list[Shape]:
     found: list[Shape] = []
     if rng.random() < 0.75:
-        found += _table(rng, rng.uniform(-0.15, 0.15) * w, rng.uniform(-0.2, 0.0) * d)
+        found += _table(rng, rng.uniform(-0.15, 0.15) * w, rng.uniform(-0.15, 0.1) * d)
     if rng.random() < 0.6:  # a cabinet at the back wall
         half = [rng.uniform(0.3, 0.8), rng.uniform(0.3, 0.7), 0.2]
         x = rng.uniform(-0.5, 0.5) * (w - 2 * half[0])
@@ -230,7 +246,7 @@ def _furniture(rng: np.random.Generator, w: float, h: float, d: float) -> list[S
         found += shapes.fence(rng, [-w / 2, 0, z], [rng.uniform(-0.2, 0.5) * w, 0, z])
     span = 0.42 * w
     for x, z, r in _places(
-        rng, int(rng.integers(3, 8)), (-span, span), (-0.42 * d, 0.12 * d), (0.12, 0.4)
+        rng, int(rng.integers(3, 8)), (-span, span), (-0.42 * d, 0.15 * d), (0.15, 0.5)
     ):
         found += shapes.thing(rng, size=2 * r, at=_at(x, 0, z))
     return found
@@ -248,7 +264,7 @@ def _table(rng: np.random.Generator, x: float, z: float) -> list[Shape]:
     posts = list(np.linspace(feet, feet * [1, 0, 1] + [0, height, 0], 2, axis=1))
     found.append(shapes.curves(posts, 0.025, at, legs, smooth=False))
     spans = (-0.8 * half_x, 0.8 * half_x), (-0.6 * half_z, 0.6 * half_z)
-    for px, pz, r in _places(rng, int(rng.integers(2, 6)), *spans, (0.06, 0.16)):
+    for px, pz, r in _places(rng, int(rng.integers(2, 6)), *spans, (0.08, 0.2)):
         found += shapes.thing(rng, size=2 * r, at=at @ _at(px, height + 0.04, pz))
     return found
 

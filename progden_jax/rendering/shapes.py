@@ -19,6 +19,9 @@ Shape = Any
 
 Points = Float[np.ndarray, "n 3"]
 
+POLE = 1e-3
+"""Where surfaces of revolution end beside their axis, so that no face there is without a normal."""
+
 
 def thing(rng: np.random.Generator, *, size: float, at: Any) -> list[Shape]:
     """Any of the things below, `size` high or wide."""
@@ -60,7 +63,7 @@ def vase(rng: np.random.Generator, size: float, at: Any) -> list[Shape]:
     knots = rng.uniform(0.12, 0.5, 6)
     radius = np.interp(heights, np.linspace(0, 1, 6), knots)
     radius = np.convolve(np.pad(radius, 4, "edge"), np.hanning(11)[1:-1] / 5.0, "valid")
-    radius = np.concatenate([[0], radius, [0]])
+    radius = np.concatenate([[POLE], radius, [POLE]])
     heights = np.concatenate([[0], heights, [1]])
     angle = np.linspace(0, 2 * np.pi, 65)
     points = np.stack(
@@ -94,7 +97,7 @@ def knot(rng: np.random.Generator, size: float, at: Any) -> list[Shape]:
 
 def rock(rng: np.random.Generator, size: float, at: Any) -> list[Shape]:
     """A sphere with noise on it."""
-    polar, angle = np.meshgrid(np.linspace(0, np.pi, 65), np.linspace(0, 2 * np.pi, 129))
+    polar, angle = np.meshgrid(np.linspace(POLE, np.pi - POLE, 65), np.linspace(0, 2 * np.pi, 129))
     # Across the poles and the seam the heights must be single-valued, so they come from a sum of waves.
     points = np.stack(
         [np.sin(polar) * np.cos(angle), np.cos(polar), np.sin(polar) * np.sin(angle)], -1
@@ -192,7 +195,7 @@ def tree(rng: np.random.Generator, size: float, at: Any) -> list[Shape]:
     faces = np.arange(4 * count).reshape(-1, 4)[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
     green = materials.rgb(rng.uniform([0.05, 0.15, 0.02], [0.35, 0.5, 0.12]))
     bsdf = {"type": "twosided", "inner": {"type": "diffuse", "reflectance": green}}
-    return [trunk, _obj(points, None, faces, at, bsdf)]
+    return [trunk, _triangles(points, None, faces, at, bsdf)]
 
 
 def box(half: Sequence[float], at: Any, bsdf: Any) -> Shape:
@@ -212,13 +215,15 @@ def mesh(grid: Float[np.ndarray, "n m 3"], at: Any, bsdf: Any) -> Shape:
     corner = (np.arange(n - 1)[:, None] * m + np.arange(m - 1)).ravel()
     quads = corner[:, None] + [0, 1, m, m, 1, m + 1]
     uv = np.stack([u, v], -1).reshape(-1, 2)
-    return _obj(grid.reshape(-1, 3), uv, quads.reshape(-1, 3), at, bsdf)
+    return _triangles(grid.reshape(-1, 3), uv, quads.reshape(-1, 3), at, bsdf)
 
 
 def curves(
     strands: Sequence[Points], radius: float, at: Any, bsdf: Any, *, smooth: bool = True
 ) -> Shape:
     """Round strands through (smooth: near) points."""
+    import mitsuba as mi
+
     ends = 2 if smooth else 0  # a B-spline begins and ends at a point that is there three times
     text = "\n\n".join(
         "\n".join(
@@ -227,29 +232,35 @@ def curves(
         for s in strands
     )  # fmt: skip
     kind = "bsplinecurve" if smooth else "linearcurve"
-    return _from_file(kind, text + "\n", ".txt", at, bsdf)
+    # Loaded at once: these plugins read files only, and ours is gone after.
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "strands.txt")
+        path.write_text(text + "\n")
+        return mi.load_dict({"type": kind, "filename": str(path), "to_world": at, "bsdf": bsdf})
 
 
-def _obj(points: Points, uv: np.ndarray | None, faces: np.ndarray, at: Any, bsdf: Any) -> Shape:
-    lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in points.tolist()]
-    if uv is not None:
-        lines += [f"vt {u:.5f} {v:.5f}" for u, v in uv.tolist()]
-    corner = "{0}/{0}" if uv is not None else "{0}"
-    lines += ["f " + " ".join(corner.format(i) for i in face) for face in (faces + 1).tolist()]
-    flat = {"face_normals": True} if uv is None else {}
-    return _from_file("obj", "\n".join(lines) + "\n", ".obj", at, bsdf, **flat)
-
-
-def _from_file(kind: str, text: str, suffix: str, at: Any, bsdf: Any, **more: Any) -> Shape:
-    """Loaded at once: these plugins read files only, and ours is gone after."""
+def _triangles(
+    points: Points, uv: np.ndarray | None, faces: np.ndarray, at: Any, bsdf: Any
+) -> Shape:
+    """A mesh, smooth if it has texture coordinates and flat if not."""
     import mitsuba as mi
 
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, f"shape{suffix}")
-        path.write_text(text)
-        return mi.load_dict(
-            {"type": kind, "filename": str(path), "to_world": at, "bsdf": bsdf, **more}
-        )
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict(bsdf)
+    smooth = uv is not None
+    properties["face_normals"] = not smooth
+    with_ = {"has_vertex_normals": smooth, "has_vertex_texcoords": smooth}
+    found = mi.Mesh("mesh", len(points), len(faces), props=properties, **with_)
+    matrix = np.array(at.matrix)
+    values = mi.traverse(found)
+    values["vertex_positions"] = (
+        (points @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32).ravel()
+    )
+    values["faces"] = faces.astype(np.uint32).ravel()
+    if uv is not None:
+        values["vertex_texcoords"] = uv.astype(np.float32).ravel()
+    values.update()
+    return found
 
 
 def _directions(rng: np.random.Generator, count: int) -> Points:
