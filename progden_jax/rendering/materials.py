@@ -36,7 +36,8 @@ def surface(rng: np.random.Generator, *, repeat: float = 1.0, bright: bool = Fal
     height = textures.PATTERNS[str(rng.choice(list(textures.PATTERNS)))](rng)
     value = (0.45, 0.85) if bright else (0.12, 0.75)
     base = color(rng, value=value, saturation=(0, 0.5))
-    darker = [c * rng.uniform(0.2, 0.8) for c in base]
+    shade = rng.uniform(0.5, 0.9) if bright else rng.uniform(0.2, 0.8)
+    darker = [c * shade for c in base]
     colors = [darker, base] if rng.random() < 0.7 else [darker, color(rng, value=value), base]
     kind = rng.choice(["diffuse", "rough", "glossy"], p=[0.55, 0.25, 0.2])
     reflectance = bitmap(textures.colored(height, colors), repeat)

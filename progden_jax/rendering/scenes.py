@@ -71,7 +71,7 @@ def room(rng: np.random.Generator) -> tuple[dict[str, Any], list[Shape]]:
         )
     found = _walls(rng, w, h, d, opening)
     # Light that comes back from the walls counts, so the flux for a mean radiance goes by their area.
-    flux = rng.uniform(0.14, 0.3) * 1.5 * np.pi * 2 * (w * h + w * d + h * d)
+    flux = rng.uniform(0.18, 0.36) * 1.5 * np.pi * 2 * (w * h + w * d + h * d)
     if lighting == "panel":
         for _ in range(int(rng.integers(1, 3))):
             at = _at(rng.uniform(-0.3, 0.3) * w, h - 0.02, rng.uniform(-0.3, 0.2) * d)
@@ -213,9 +213,11 @@ def _daylight(rng: np.random.Generator, flux: float, w: float, opening: Any) -> 
     toward = np.array([rng.uniform(0.7, 1), rng.uniform(0.5, 1), rng.uniform(-0.5, 0.5)])
     toward /= np.linalg.norm(toward)
     distance, area = 12.0, width * (top - bottom) * toward[0]
-    sun = lights.bulb(rng, flux / area * 4 * np.pi * distance**2, middle + distance * toward, 0.12)
+    sun = lights.bulb(
+        rng, 0.5 * flux / area * 4 * np.pi * distance**2, middle + distance * toward, 0.12
+    )
     sky = lights.sky(rng, sun=False)
-    level = rng.uniform(0.1, 0.25) * flux / (width * (top - bottom))
+    level = rng.uniform(0.3, 0.6) * flux / (width * (top - bottom))
     return [sun, lights.environment(sky * (level / lights.irradiance(sky, (1, 0, 0))))]
 
 
