@@ -159,6 +159,9 @@ def render(
                 written = bar.run(job, output, force=force)
                 if preview:
                     _save_preview(job, output)
+            except KeyboardInterrupt:
+                complain(f"stopped in {job.name}; the same command goes on")
+                raise
             except (ValueError, OSError) as error:
                 complain(f"{job.name}: {explain(error)}")
                 failed += 1

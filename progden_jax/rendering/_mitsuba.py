@@ -52,7 +52,7 @@ def jit() -> bool:
     """Whether the variant that is set traces whole wavefronts in compiled kernels."""
     import mitsuba as mi
 
-    return not mi.variant().startswith("scalar")
+    return not (mi.variant() or "").startswith("scalar")
 
 
 def _problem(variant: str, known: list[str]) -> str:

@@ -190,8 +190,8 @@ def render(
         partial = folder / f".{job.name}_{'reference' if reference else 'series'}.partial"
         discarded = 0
         for moments in _resumed(samples, partial, job.made_of, counts, progress):
-            if moments.count in counts:
-                path = job.path(folder, moments.count)
+            if moments.spp in counts:
+                path = job.path(folder, moments.spp)
                 _write(path, moments, job.made_of, auxiliary=not reference)
                 written.append(path)
             discarded = moments.discarded
@@ -222,27 +222,27 @@ def _resumed(
     with contextlib.suppress(ValueError):  # of another render: of no use here
         if 0 < (count := _checkpoint.load(partial, made_of, packed)) < counts[0]:
             moments = _unpack(packed, count, samples.size)
-    progress(moments.count)
-    saved, last, cost = moments.count, time.monotonic(), 0.0
+    progress(moments.spp)
+    saved, last, cost = moments.spp, time.monotonic(), 0.0
     try:
         for grown in grow(samples, moments, counts):
-            progress(grown.count - moments.count)
+            progress(grown.spp - moments.spp)
             moments = grown
             yield moments
             if time.monotonic() - last > max(SAVE_SECONDS, SAVE_RATIO * cost):
                 begin = time.monotonic()
                 _save(partial, made_of, moments)
-                saved, last = moments.count, time.monotonic()
+                saved, last = moments.spp, time.monotonic()
                 cost = last - begin
     except BaseException:
-        if moments.count > saved:
+        if moments.spp > saved:
             _save(partial, made_of, moments)
         raise
 
 
 def _save(partial: Path, made_of: str, moments: Moments) -> None:
     try:
-        _checkpoint.save(partial, made_of, _pack(moments), moments.count)
+        _checkpoint.save(partial, made_of, _pack(moments), moments.spp)
     except OSError as error:
         # What was rendered so far is worth more than its checkpoint.
         _log.warning("cannot write the checkpoint %s: %s", partial, error)

@@ -62,7 +62,7 @@ def environment(sky: Sky) -> Shape:
     return {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(sky, np.float32))}
 
 
-def panel(rng: np.random.Generator, flux: float, at: Any, half: Sequence[float]) -> Shape:
+def panel(rng: np.random.Generator, flux: float, at: Any, half: shapes.Vector) -> Shape:
     """A rectangle of these half sides that shines along -y."""
     import mitsuba as mi
 
@@ -76,7 +76,7 @@ def panel(rng: np.random.Generator, flux: float, at: Any, half: Sequence[float])
     }
 
 
-def bulb(rng: np.random.Generator, flux: float, center: Sequence[float], radius: float) -> Shape:
+def bulb(rng: np.random.Generator, flux: float, center: shapes.Vector, radius: float) -> Shape:
     return {
         "type": "sphere",
         "center": [float(c) for c in center],
@@ -87,7 +87,7 @@ def bulb(rng: np.random.Generator, flux: float, center: Sequence[float], radius:
 
 
 def hanging(
-    rng: np.random.Generator, flux: float, ceiling: Sequence[float], length: float
+    rng: np.random.Generator, flux: float, ceiling: shapes.Vector, length: float
 ) -> list[Shape]:
     """A bulb on a wire, half of the time under a shade."""
     import mitsuba as mi

@@ -10,14 +10,14 @@ AUXILIARY = 7
 
 
 class Moments(NamedTuple):
-    """What `count` samples per pixel say; immutable, so that an interrupt finds it whole.
+    """What `spp` samples per pixel say; immutable, so that an interrupt finds it whole.
 
     `mean` and `squares` (sums of squared deviations from it) are (H, W, 3) of radiance, `auxiliary` is
     the mean of (H, W, 7) albedo, normal and depth, all float64; `discarded` counts samples that were
     not finite, which stand as black.
     """
 
-    count: int
+    spp: int
     mean: Float[np.ndarray, "h w 3"]
     squares: Float[np.ndarray, "h w 3"]
     auxiliary: Float[np.ndarray, "h w 7"]
@@ -26,7 +26,7 @@ class Moments(NamedTuple):
     @property
     def variance(self) -> Float[np.ndarray, "h w 3"]:
         """Of the mean, unbiased; needs two samples."""
-        return self.squares / (self.count * (self.count - 1))
+        return self.squares / (self.spp * (self.spp - 1))
 
 
 def none(height: int, width: int) -> Moments:
@@ -50,7 +50,7 @@ def add(
     if discarded:
         samples[bad] = 0
     n = len(samples)
-    total = moments.count + n
+    total = moments.spp + n
     mean = samples.mean(0)
     samples -= mean
     samples *= samples
@@ -61,7 +61,7 @@ def add(
     return Moments(
         total,
         moments.mean + shift * (n / total),
-        moments.squares + samples.sum(0) + shift * shift * (moments.count * (n / total)),
+        moments.squares + samples.sum(0) + shift * shift * (moments.spp * (n / total)),
         aux,
         moments.discarded + discarded,
     )

@@ -51,19 +51,19 @@ def series(
     counts = checked_spp(spp)
     samples = Samples(loaded(scene), size=size, seed=seed, sensor=sensor, max_depth=max_depth)
     for moments in grow(samples, none(*samples.size), counts):
-        if moments.count in counts:
+        if moments.spp in counts:
             yield frame(moments)
 
 
 def grow(samples: Samples, moments: Moments, counts: Sequence[int]) -> Iterator[Moments]:
-    """The moments after every wave, and whenever one of the counts above `moments.count` is reached."""
-    stops = [count for count in counts if count > moments.count]
+    """The moments after every wave, and whenever one of the counts above `moments.spp` is reached."""
+    stops = [count for count in counts if count > moments.spp]
     if not stops:
         return
-    for wave in samples.waves(moments.count, stops[-1]):
+    for wave in samples.waves(moments.spp, stops[-1]):
         end = wave.start + len(wave.radiance)
-        for stop in [stop for stop in stops if moments.count < stop < end] + [end]:
-            part = slice(moments.count - wave.start, stop - wave.start)
+        for stop in [stop for stop in stops if moments.spp < stop < end] + [end]:
+            part = slice(moments.spp - wave.start, stop - wave.start)
             aux = None if wave.auxiliary is None else wave.auxiliary[part]
             moments = add(moments, wave.radiance[part], aux)
             yield moments
@@ -75,8 +75,8 @@ def frame(moments: Moments, *, auxiliary: bool = True) -> Frame:
         values.astype(np.float32) for values in (moments.mean, moments.variance, moments.auxiliary)
     )
     if not auxiliary:
-        return Frame(color, variance, spp=moments.count)
-    return Frame(color, variance, aux[..., :3], aux[..., 3:6], aux[..., 6:], spp=moments.count)
+        return Frame(color, variance, spp=moments.spp)
+    return Frame(color, variance, aux[..., :3], aux[..., 3:6], aux[..., 6:], spp=moments.spp)
 
 
 def checked_spp(spp: Sequence[int]) -> tuple[int, ...]:

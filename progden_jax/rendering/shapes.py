@@ -17,6 +17,7 @@ from progden_jax.rendering import materials
 Shape = Any
 """A dictionary for `mitsuba.load_dict`, or what that made of one."""
 
+Vector = Sequence[float] | np.ndarray
 Points = Float[np.ndarray, "n 3"]
 
 POLE = 1e-3
@@ -164,7 +165,7 @@ THINGS: dict[str, Callable[[np.random.Generator, float, Any], list[Shape]]] = {
 }
 
 
-def fence(rng: np.random.Generator, start: Sequence[float], end: Sequence[float]) -> list[Shape]:
+def fence(rng: np.random.Generator, start: Vector, end: Vector) -> list[Shape]:
     """Thin upright rods and two rails from one point on the ground to another."""
     start_, end_ = np.asarray(start, float), np.asarray(end, float)
     count = int(np.linalg.norm(end_ - start_) / rng.uniform(0.06, 0.2)) + 2
@@ -198,7 +199,7 @@ def tree(rng: np.random.Generator, size: float, at: Any) -> list[Shape]:
     return [trunk, _triangles(points, None, faces, at, bsdf)]
 
 
-def box(half: Sequence[float], at: Any, bsdf: Any) -> Shape:
+def box(half: Vector, at: Any, bsdf: Any) -> Shape:
     """A box that stands on y = 0, by its half sides."""
     x, y, z = (float(v) for v in half)
     return {
