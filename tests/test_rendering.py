@@ -181,6 +181,35 @@ def test_what_goes_with_the_colour():
     assert ((centre > 4) & (centre < 5)).all()  # the ball's front, 5.1 − 1 from the camera
 
 
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
+def test_a_camera_in_a_medium(variant):
+    """A lamp that fills the view, two metres off, through fog that absorbs half a nat per metre."""
+    if variant.startswith("llvm") and _mitsuba._llvm_problem():
+        pytest.skip("needs a libLLVM that works")
+    mi = rendering.use_variant(variant)
+    fog = {"type": "homogeneous", "albedo": 0.0, "sigma_t": 0.5}
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "volpath"},
+        "fog": fog,
+        "sensor": {
+            "type": "perspective",
+            "fov": 2.0,
+            "inside": {"type": "ref", "id": "fog"},
+            "film": {"type": "hdrfilm", "height": 2, "width": 2},
+        },
+        "lamp": {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().translate([0, 0, 2]).rotate([0, 1, 0], 180),
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 3.0}},
+        },
+    }
+    (frame,) = rendering.series(scene, [1024])
+    mean, sd = np.mean(frame.color), np.sqrt(np.mean(frame.variance) / 4)
+    assert 0 < sd < 0.05
+    assert abs(mean - 3 * np.exp(-1)) < 4 * sd
+
+
 @pytest.mark.parametrize("kind", list(rendering.KINDS))
 def test_a_seed_gives_the_same_scene_and_image(kind):
     def picture(seed):
@@ -298,7 +327,9 @@ def test_an_interrupted_render_goes_on_to_the_same_bytes(command, progden, tmp_p
         stops[:] = [stop]
         status, _, stderr = progden(*command)
         assert status == 130
-        assert stderr == "progden: stopped in ball; the same command goes on\nprogden: interrupted\n"
+        assert (
+            stderr == "progden: stopped in ball; the same command goes on\nprogden: interrupted\n"
+        )
     assert (out / "ball_000008spp.exr").exists()
     assert (out / ".ball_reference.partial").exists()
     stops.clear()

@@ -84,7 +84,12 @@ class Samples:
             "component_format": "float32",
         }
         # A batch of one: it brings a film and a sampler of ours to whatever sensor the scene has.
-        self._spec = {"type": "batch", "inner": sensors[sensor], "film": mi.load_dict(film)}
+        inner = sensors[sensor]
+        opened, open_time = inner.shutter_open(), inner.shutter_open_time()
+        self._spec = {"type": "batch", "inner": inner, "film": mi.load_dict(film)}
+        self._spec |= {"shutter_open": opened, "shutter_close": opened + open_time}
+        if (medium := inner.get_medium()) is not None:
+            self._spec["medium"] = medium
         self._sensor = self._sensor_with(seed=0)
         pixels = self.size[0] * self.size[1]
         self._largest = 1 << max(0, (PATHS // pixels).bit_length() - 1)
@@ -141,7 +146,7 @@ class Samples:
         if (open_time := sensor.shutter_open_time()) > 0:
             time += sampler.next_1d() * open_time
         rays, weight = sensor.sample_ray_differential(time, 0.0, position, aperture)
-        radiance, _, _ = self._integrator.sample(self._scene, sampler, rays)
+        radiance, _, _ = self._integrator.sample(self._scene, sampler, rays, sensor.get_medium())
         found = [*(weight * radiance)]
         if self._auxiliary:
             found += self._aov.sample(self._scene, sampler, rays)[2]

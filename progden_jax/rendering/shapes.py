@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from progden_jax.rendering import materials
+from progden_jax.rendering import layout, materials
 
 Shape = Any
 """A dictionary for `mitsuba.load_dict`, or what that made of one."""
@@ -27,17 +27,17 @@ POLE = 1e-3
 def thing(rng: np.random.Generator, *, size: float, at: Any) -> list[Shape]:
     """Any of the things below, `size` high or wide."""
     make = THINGS[str(rng.choice(list(THINGS)))]
-    turn = at @ _transform().rotate([0, 1, 0], rng.uniform(0, 360))
+    turn = at @ layout.transform().rotate([0, 1, 0], rng.uniform(0, 360))
     return make(rng, size, turn)
 
 
 def ball(rng: np.random.Generator, size: float, at: Any) -> list[Shape]:
     r = size / 2
-    to_world = at @ _transform().translate([0, r, 0]).scale(r)
+    to_world = at @ layout.transform().translate([0, r, 0]).scale(r)
     found: list[Shape] = [{"type": "sphere", "to_world": to_world, "bsdf": materials.solid(rng)}]
     if found[0]["bsdf"]["type"] == "dielectric" and rng.random() < 0.4:
         # Hollow: the inner side is glass seen from within.
-        hole = at @ _transform().translate([0, r, 0]).scale(0.93 * r)
+        hole = at @ layout.transform().translate([0, r, 0]).scale(0.93 * r)
         found.append(found[0] | {"to_world": hole, "flip_normals": True})
     return found
 
@@ -52,7 +52,9 @@ def stack(rng: np.random.Generator, size: float, at: Any) -> list[Shape]:
     found, y = [], 0.0
     for _ in range(int(rng.integers(2, 7))):
         sides = size / 2 * np.array([rng.uniform(0.6, 1), rng.uniform(0.05, 0.2), 0.7])
-        turned = at @ _transform().translate([0, y, 0]).rotate([0, 1, 0], rng.uniform(-20, 20))
+        turned = at @ layout.transform().translate([0, y, 0]).rotate(
+            [0, 1, 0], rng.uniform(-20, 20)
+        )
         found.append(box(sides, turned, materials.solid(rng)))
         y += 2 * sides[1]
     return found
@@ -89,10 +91,10 @@ def knot(rng: np.random.Generator, size: float, at: Any) -> list[Shape]:
     thick = rng.uniform(0.04, 0.07) if q else rng.uniform(0.06, 0.12)
     angle = np.linspace(0, 2 * np.pi, 33)[:, None, None]
     points = center + thick * (np.cos(angle) * side + np.sin(angle) * up)
-    lift = _transform().translate([0, (0.12 * (q > 0) + thick) * size, 0])
+    lift = layout.transform().translate([0, (0.12 * (q > 0) + thick) * size, 0])
     if rng.random() < 0.5:  # on its edge
         outer = (wide + 0.12 * (q > 0) + thick) * size
-        lift = _transform().translate([0, outer, 0]).rotate([1, 0, 0], 90)
+        lift = layout.transform().translate([0, outer, 0]).rotate([1, 0, 0], 90)
     return [mesh(points * size, at @ lift, materials.solid(rng))]
 
 
@@ -125,7 +127,7 @@ def hair_ball(rng: np.random.Generator, size: float, at: Any) -> list[Shape]:
         points = direction * (0.25 + length * t * 0.4) + wave
         points[:, 1] -= droop * (t[:, 0] * length) ** 2
         strands.append(points * size + [0, 0.48 * size, 0])
-    core = at @ _transform().translate([0, 0.48 * size, 0]).scale(0.25 * size)
+    core = at @ layout.transform().translate([0, 0.48 * size, 0]).scale(0.25 * size)
     bsdf = materials.strand(rng)
     return [
         curves(strands, 0.004 * size * rng.uniform(0.7, 2), at, bsdf),
@@ -174,7 +176,7 @@ def fence(rng: np.random.Generator, start: Vector, end: Vector) -> list[Shape]:
     feet = start_ + np.linspace(0, 1, count)[:, None] * (end_ - start_)
     rods = [np.stack([foot, foot + up]) for foot in feet]
     rods += [np.stack([start_ + share * up, end_ + share * up]) for share in (0.15, 0.9)]
-    return [curves(rods, radius, _transform(), materials.strand(rng), smooth=False)]
+    return [curves(rods, radius, layout.transform(), materials.strand(rng), smooth=False)]
 
 
 def tree(rng: np.random.Generator, size: float, at: Any) -> list[Shape]:
@@ -204,7 +206,7 @@ def box(half: Vector, at: Any, bsdf: Any) -> Shape:
     x, y, z = (float(v) for v in half)
     return {
         "type": "cube",
-        "to_world": at @ _transform().translate([0, y, 0]).scale([x, y, z]),
+        "to_world": at @ layout.transform().translate([0, y, 0]).scale([x, y, z]),
         "bsdf": bsdf,
     }
 
@@ -267,9 +269,3 @@ def _triangles(
 def _directions(rng: np.random.Generator, count: int) -> Points:
     found = rng.normal(size=(count, 3))
     return found / np.linalg.norm(found, axis=-1, keepdims=True)
-
-
-def _transform() -> Any:
-    import mitsuba as mi
-
-    return mi.ScalarTransform4f()
