@@ -34,7 +34,7 @@ def room(rng: np.random.Generator) -> tuple[dict[str, Any], list[Shape]]:
             top = rng.uniform(-0.3, 0.3) * w, h, rng.uniform(-0.35, 0.15) * d
             found += lights.hanging(rng, flux / count, top, rng.uniform(0.3, 1.0))
     elif opening is not None:
-        found += _daylight(rng, flux, w, opening)
+        found += _daylight(rng, flux, w, h, opening)
     else:
         found += _string(rng, flux, w, h, d)
     found += _furniture(rng, w, h, d)
@@ -78,11 +78,13 @@ def _walls(rng: np.random.Generator, w: float, h: float, d: float, opening: Any)
     return found
 
 
-def _daylight(rng: np.random.Generator, flux: float, w: float, opening: Any) -> list[Shape]:
-    """An overcast sky close behind the window, or a sun with a sky that gives little."""
+def _daylight(
+    rng: np.random.Generator, flux: float, w: float, h: float, opening: Any
+) -> list[Shape]:
+    """An overcast sky close behind the window, or a sun, which needs a lamp inside for the shadows."""
     z, bottom, width, top = opening
     middle = np.array([w / 2, (bottom + top) / 2, z])
-    if rng.random() < 0.5:
+    if rng.random() < 0.6:
         at = layout.at(w / 2 + 0.15, (bottom + top) / 2, z) @ layout.transform().rotate(
             [0, 0, 1], -90
         )
@@ -91,11 +93,13 @@ def _daylight(rng: np.random.Generator, flux: float, w: float, opening: Any) -> 
     toward /= np.linalg.norm(toward)
     distance, area = 12.0, width * (top - bottom) * toward[0]
     sun = lights.bulb(
-        rng, 0.6 * flux / area * 4 * np.pi * distance**2, middle + distance * toward, 0.12
+        rng, 0.2 * flux / area * 4 * np.pi * distance**2, middle + distance * toward, 0.12
     )
     sky = lights.sky(rng, sun=False)
-    level = rng.uniform(0.5, 0.9) * flux / (width * (top - bottom))
-    return [sun, lights.environment(sky * (level / lights.irradiance(sky, (1, 0, 0))))]
+    level = rng.uniform(0.1, 0.3) * flux / (width * (top - bottom))
+    outside = lights.environment(sky * (level / lights.irradiance(sky, (1, 0, 0))))
+    lamp = lights.panel(rng, 0.7 * flux, layout.at(0, h - 0.02, z), rng.uniform(0.15, 0.5, 2))
+    return [sun, outside, lamp]
 
 
 def _furniture(rng: np.random.Generator, w: float, h: float, d: float) -> list[Shape]:
