@@ -358,6 +358,17 @@ class TestWrite:
         np.testing.assert_array_equal(back.albedo, np.float16(self.image / 3))
         assert float(back.color.max()) == 65504
 
+    def test_half_for_some_layers_and_texts_in_the_header(self, tmp_path):
+        ones = np.ones((3, 4, 3), "f4")
+        frame = Frame(ones, ones, ones, ones)
+        path = tmp_path / "a.exr"
+        write_exr(path, frame, half=("Albedo", "Normal"), attributes={"madeBy": "a test"})
+        channels, header = read_channels(path)
+        halves = {name for name, pixels in channels.items() if pixels.dtype == np.float16}
+        assert halves == {n for n in channels if n.startswith(("Albedo.", "Normal."))}
+        assert len(halves) == 6
+        assert header["madeBy"] == "a test"
+
     def test_half_keeps_bad_values(self, tmp_path):
         image = self.image.copy()
         image[0, 0] = np.nan, np.inf, -np.inf

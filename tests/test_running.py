@@ -11,8 +11,9 @@ from conftest import counting_compilations, dense_jacobian_diagonal
 from test_exact import Network, network
 
 import progden_jax as pd
+from progden_jax import _checkpoint
 from progden_jax.denoisers.graph import Conv, Input, MaxPool, Relu, Upsample
-from progden_jax.divergence import _checkpoint, running
+from progden_jax.divergence import running
 
 
 @jax.tree_util.register_pytree_node_class

@@ -16,6 +16,8 @@ from progden_jax.cli.devices import HELP as DEVICES_HELP
 from progden_jax.cli.devices import devices
 from progden_jax.cli.info import HELP as INFO_HELP
 from progden_jax.cli.info import info
+from progden_jax.cli.render import HELP as RENDER_HELP
+from progden_jax.cli.render import render
 from progden_jax.cli.train import app as train
 
 app = App(
@@ -32,6 +34,7 @@ _COMMANDS = {
     "denoise": (denoise, "IN... -o OUT [OPTIONS]", DENOISE_HELP),
     "info": (info, "IN... [OPTIONS]", INFO_HELP),
     "demo": (demo, "[OPTIONS]", DEMO_HELP),
+    "render": (render, "[SCENE...] -o OUT [OPTIONS]", RENDER_HELP),
     "devices": (devices, "[OPTIONS]", DEVICES_HELP),
 }
 for _name, (_command, _arguments, _help) in _COMMANDS.items():

@@ -14,6 +14,7 @@ from cyclopts import CycloptsError
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.progress import Progress
 
 _MISSING = re.compile(r'Command "\w+" parameter (\S+) requires an argument\.')
 
@@ -76,6 +77,14 @@ def explain(error: Exception) -> str:
 def complain(message: str) -> None:
     """A line on stderr."""
     print(f"progden: {message}", file=sys.stderr, flush=True)
+
+
+def show(line: str, bars: "Progress") -> None:
+    """A line on stdout; on one terminal the bars have to make room for it."""
+    if bars.disable or not sys.stdout.isatty():
+        print(line, flush=True)
+    else:
+        bars.console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def tables() -> "Console":

@@ -1,7 +1,6 @@
 """`progden denoise`: files in, files out."""
 
 import os
-import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
@@ -19,7 +18,16 @@ from progden_jax.cli._options import (
     parse_save,
 )
 from progden_jax.cli._paths import Item, plan
-from progden_jax.cli._run import FAILED, OK, UsageError, complain, explain, print_json, tables
+from progden_jax.cli._run import (
+    FAILED,
+    OK,
+    UsageError,
+    complain,
+    explain,
+    print_json,
+    show,
+    tables,
+)
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
@@ -160,7 +168,7 @@ def _run_all(
                 for warning in outcome.warnings:
                     complain(_about(outcome.input, f"warning: {warning}"))
                 if outcome.ok and not json:
-                    bars.show(outcome.line())
+                    show(outcome.line(), bars.bars)
     except KeyboardInterrupt:
         outcomes = [o for o in outcomes if o.ok or o.error]
         again = "; the same command with --resume goes on" if len(items) > 1 else ""
@@ -242,13 +250,6 @@ class _Bars:
         if self.part is not None:
             self.bars.remove_task(self.part)
             self.part = None
-
-    def show(self, line: str) -> None:
-        """A line on stdout; on one terminal the bars have to make room for it."""
-        if self.bars.disable or not sys.stdout.isatty():
-            print(line, flush=True)
-        else:
-            self.console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def _print_scores(outcomes: "list[Outcome]") -> None:

@@ -1,14 +1,13 @@
 """`progden train`: weights from renders."""
 
 import contextlib
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Parameter
 
-from progden_jax.cli._run import OK, UsageError, print_json
+from progden_jax.cli._run import OK, UsageError, print_json, show
 
 if TYPE_CHECKING:
     from progden_jax.training import RunConfig, Task
@@ -209,10 +208,7 @@ class _Report:
         line = (
             f"step {step}: score {scores.score:.4f}{' (best)' if best else ''}; {_summary(scores)}"
         )
-        if self._bar.disable or not sys.stdout.isatty():
-            print(line, flush=True)
-        else:
-            self._bar.console.print(line, markup=False, highlight=False, soft_wrap=True)
+        show(line, self._bar)
 
     def close(self) -> None:
         self._bar.stop()

@@ -15,9 +15,10 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from progden_jax import _checkpoint
 from progden_jax._fingerprint import fingerprint
 from progden_jax.denoisers import graph
-from progden_jax.divergence import _checkpoint, _reach, cone, exact, windows
+from progden_jax.divergence import _reach, cone, exact, windows
 from progden_jax.divergence._base import Evaluation, Function, check_arguments
 from progden_jax.divergence.exact import Exact
 

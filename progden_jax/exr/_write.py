@@ -1,7 +1,7 @@
 """Frames, images and named layers into an OpenEXR file that is either whole or not there."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, NoReturn
 
 import numpy as np
@@ -43,8 +43,9 @@ def write_exr(
     like: PathLike | ExrInfo | None = None,
     spp: float | None = None,
     overwrite: bool = False,
-    half: bool = False,
+    half: bool | Collection[str] = False,
     compression: str = "zip",
+    attributes: Mapping[str, str] | None = None,
 ) -> tuple[str, ...]:
     """Write an image or a frame with named layers; returns notes on what had to be changed.
 
@@ -64,8 +65,10 @@ def write_exr(
         that of `like`.
     overwrite : whether an existing file may be replaced.
     half : store colour, albedo, normal and layers in half precision, clipping at ±65504; variance
-        and depth, whose range half does not hold, stay float.
+        and depth, whose range half does not hold, stay float. Or the names of the layers to store
+        so, such as ("Albedo", "Normal").
     compression : none, rle, zips, zip or piz (lossless); pxr24, b44, b44a, dwaa or dwab (lossy).
+    attributes : texts to write into the header, by name.
 
     Raises
     ------
@@ -101,6 +104,7 @@ def write_exr(
             channels.setdefault("A", alpha)
     if spp is not None:
         header["samplesPerPixel"] = int(spp) if float(spp).is_integer() else float(spp)
+    header |= attributes or {}
     header |= {
         "type": OpenEXR.scanlineimage,
         "compression": getattr(
@@ -128,7 +132,7 @@ def _check_target(path: PathLike, overwrite: bool) -> str:
 
 
 def _channels_of(
-    image: Any, layers: Mapping[str, Any], *, half: bool, notes: list[str]
+    image: Any, layers: Mapping[str, Any], *, half: bool | Collection[str], notes: list[str]
 ) -> tuple[dict[str, np.ndarray], tuple[int, int]]:
     pictures: dict[str, tuple[Any, str]] = {"": (image, "RGB")}
     if isinstance(image, Frame):
@@ -154,7 +158,8 @@ def _channels_of(
             continue
         what = f"layers[{name!r}]" if name in layers else "image"
         pixels = _pixels(value, what, len(components), size)
-        if half and name not in ("Variance", "Depth"):
+        wide = name in ("Variance", "Depth")
+        if (half and not wide) if isinstance(half, bool) else name in half:
             pixels = _to_half(pixels, name or "the image", notes)
         for i, component in enumerate(components):
             # Contiguous: of strided arrays the library writes the wrong values.

@@ -9,7 +9,7 @@ import numpy as np
 
 from progden_jax._files import replacing
 
-FORMAT = "progden-exact-1"
+FORMAT = "progden-checkpoint-1"
 
 logger = logging.getLogger(__name__)
 
