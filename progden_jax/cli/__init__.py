@@ -16,6 +16,8 @@ from progden_jax.cli.devices import HELP as DEVICES_HELP
 from progden_jax.cli.devices import devices
 from progden_jax.cli.info import HELP as INFO_HELP
 from progden_jax.cli.info import info
+from progden_jax.cli.report import HELP as REPORT_HELP
+from progden_jax.cli.report import report
 from progden_jax.cli.train import app as train
 
 app = App(
@@ -31,6 +33,7 @@ app = App(
 _COMMANDS = {
     "denoise": (denoise, "IN... -o OUT [OPTIONS]", DENOISE_HELP),
     "info": (info, "IN... [OPTIONS]", INFO_HELP),
+    "report": (report, "RUN -o SITE [OPTIONS]", REPORT_HELP),
     "demo": (demo, "[OPTIONS]", DEMO_HELP),
     "devices": (devices, "[OPTIONS]", DEVICES_HELP),
 }
