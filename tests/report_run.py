@@ -11,7 +11,7 @@ from progden_jax import metrics
 from progden_jax.exr import write_exr
 
 HEIGHT, WIDTH = 16, 24
-SCENES = ("attic", '<b>"&</script>', "café 10")
+SCENES = ("#1 attic", '<b>"&</script>', "café 10")
 SPPS = (2, 8)
 METHODS = ("render", "denoised", "mix MonteCarlo(1)")
 
@@ -19,7 +19,8 @@ METHODS = ("render", "denoised", "mix MonteCarlo(1)")
 SCHEMA = """
 PRAGMA user_version = 1;
 CREATE TABLE results(
-  key TEXT PRIMARY KEY, scene TEXT NOT NULL, spp INTEGER NOT NULL, method TEXT NOT NULL, settings TEXT NOT NULL,
+  key TEXT PRIMARY KEY, scene TEXT NOT NULL, spp INTEGER NOT NULL, method TEXT NOT NULL,
+  settings TEXT NOT NULL,
   rmse REAL, smape REAL, relmse REAL, flip REAL, ssim REAL, mse REAL, sure REAL, denoised_mse REAL,
   seconds REAL, render TEXT, reference TEXT, image TEXT, created TEXT NOT NULL)
 """

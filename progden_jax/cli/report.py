@@ -10,9 +10,9 @@ from progden_jax.cli._run import complain
 
 HELP = """Make a page of a run's results: pictures, convergence plots, tables.
 
-RUN is a folder that `progden evaluate` or `progden sweep` wrote. Open SITE/index.html in a browser: it needs no
-network and no server. Pictures are compared side by side or flipped by number keys, with linked zoom, at any exposure;
-`?` lists the keys.
+RUN is a folder that `progden evaluate` or `progden sweep` wrote. Open SITE/index.html in a browser: it needs
+no network and no server. Pictures are compared side by side or flipped by number keys, with linked zoom, at
+any exposure; `?` lists the keys.
 
 ```
 progden report runs/table1 -o site/
@@ -40,6 +40,10 @@ def report(
         Literal["auto", "none"],
         Parameter(help="auto: the pictures that the run kept; none: tables and plots alone."),
     ] = "auto",
+    flip: Annotated[
+        Literal["auto", "all", "none"],
+        Parameter(help="FLIP maps: auto, of pictures of up to 512×512 pixels; all; none."),
+    ] = "auto",
     force: Annotated[bool, Parameter(help="Replace a report that exists.")] = False,
 ) -> None:
     from progden_jax.report import build_report
@@ -51,6 +55,7 @@ def report(
             title=title,
             scenes=scenes,
             images=images == "auto",
+            flip=flip,
             force=force,
             progress=progress,
         )

@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -20,8 +20,12 @@ from progden_jax.report.rows import Row, rows
 
 Progress = Callable[[int, int], None]
 """Called with how many of how many rows have their pictures."""
+T = TypeVar("T")
+Flip = Literal["auto", "all", "none"]
 
 _SITE = Path(__file__).parent / "site"
+# Of the largest image that has a FLIP map unasked: a 1920×1080 one takes minutes.
+_FLIP_PIXELS = 512 * 512
 # What a report's folder holds; anything else in it is somebody's own.
 _OURS = {"index.html", "report.css", "js", "data.js", "images"}
 _MARK = '<meta name="generator" content="progden report"'
@@ -43,6 +47,7 @@ def build_report(
     title: str | None = None,
     scenes: Collection[str] = (),
     images: bool = True,
+    flip: Flip = "auto",
     force: bool = False,
     progress: Progress = lambda done, total: None,
 ) -> Built:
@@ -58,6 +63,8 @@ def build_report(
     title : the page's title; by default the run folder's name.
     scenes : only these; by default all.
     images : False leaves pictures out.
+    flip : which pictures get a FLIP map: "auto" those of up to 512×512 pixels, for larger ones take
+        a minute or more each, "all", or "none".
     force : whether a report that is already there may be replaced.
 
     Raises
@@ -72,7 +79,7 @@ def build_report(
     _check_output(run, output, force)
     with _files.replacing_folder(output) as beside:
         shutil.copytree(_SITE, beside, dirs_exist_ok=True)
-        gathered = _Gathered(run, ImageFiles(beside / "images"), len(chosen), progress)
+        gathered = _Gathered(run, ImageFiles(beside / "images"), flip, len(chosen), progress)
         if images:
             gathered.add(chosen)
         contents = document(
@@ -123,11 +130,14 @@ def _is_report(folder: Path, held: set[str]) -> bool:
 class _Gathered:
     """Pictures and exposures of rows, worked on in threads: reading, FLIP and deflate release Python."""
 
-    def __init__(self, run: Path, files: ImageFiles, total: int, progress: Progress) -> None:
+    def __init__(
+        self, run: Path, files: ImageFiles, flip: Flip, total: int, progress: Progress
+    ) -> None:
         self.pictures: dict[str, Pictures] = {}
         self.exposures: dict[str, float] = {}
         self.warnings: list[str] = []
-        self._run, self._files, self._total, self._progress = run, files, total, progress
+        self._run, self._files, self._which_flip = run, files, flip
+        self._total, self._progress = total, progress
         self._lock = threading.Lock()
 
     def add(self, chosen: Sequence[Row]) -> None:
@@ -181,6 +191,14 @@ class _Gathered:
         return {} if color is None else {"": color}
 
     def _flip(self, image: np.ndarray, reference: np.ndarray, row: Row) -> str | None:
+        if self._which_flip == "none":
+            return None
+        if self._which_flip == "auto" and image.shape[0] * image.shape[1] > _FLIP_PIXELS:
+            self._warn(
+                "pictures of more than 512×512 pixels have no FLIP maps, which would take minutes each: "
+                "--flip all makes them"
+            )
+            return None
         try:
             errors = metrics.flip_map(image, reference)
         except ValueError as error:
@@ -189,7 +207,7 @@ class _Gathered:
         # A display has no more steps, and what is beyond them is most of the file.
         return self._files.add((np.round(errors * 256) / 256)[..., None])
 
-    def _read(self, path, read):
+    def _read(self, path: str | None, read: Callable[[str], T]) -> T | None:
         """What `read` makes of the file, None with a warning if it cannot, None without a path."""
         if path is None:
             return None

@@ -54,4 +54,5 @@ def rows(run: Path) -> list[Row]:
             connection.close()
     except sqlite3.DatabaseError as error:
         raise ValueError(f"{path} cannot be read as results: {error}.") from None
-    return [(row := Row(*values))._replace(settings=json.loads(values[4])) for values in found]
+    settings = Row._fields.index("settings")
+    return [Row(*values)._replace(settings=json.loads(values[settings])) for values in found]

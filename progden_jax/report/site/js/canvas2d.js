@@ -6,6 +6,40 @@ progden.canvas2d = (canvas) => {
   const { floats } = progden.images;
   const context = canvas.getContext("2d");
 
+  // As bytes R, G, B, A lie in memory, on all machines that browsers run on.
+  const pack = (r, g, b) => (r | (g << 8) | (b << 16) | (255 << 24)) >>> 0;
+  const MAGENTA = pack(...BAD);
+
+  /** Pixel's index -> its colour on screen. */
+  function picture({ channels, halves, scale }, factor, tone) {
+    // The bytes of every half float there is: far fewer than there are pixels.
+    const { apply } = TONES[tone];
+    const bytes = Uint8ClampedArray.from(
+      floats, (v) => 255 * toSrgb(apply(Math.max(v * scale * factor, 0))));
+    const next = channels === 1 ? 0 : 1;
+    return (index) => {
+      const at = index * channels;
+      const [r, g, b] = [halves[at], halves[at + next], halves[at + 2 * next]];
+      if (!Number.isFinite(floats[r] + floats[g] + floats[b])) return MAGENTA;
+      return pack(bytes[r], bytes[g], bytes[b]);
+    };
+  }
+
+  /** Pixel's index -> the colour of a map's value. */
+  function mapOf(image, reference, map, full) {
+    const given = MAPS[map];
+    const { channels } = image;
+    return (index) => {
+      let sum = 0;
+      for (let at = index * channels; at < (index + 1) * channels; at++) {
+        const z = floats[image.halves[at]] * image.scale;
+        sum += given.error ? given.error(z, floats[reference.halves[at]] * reference.scale) : z;
+      }
+      if (!Number.isFinite(sum)) return MAGENTA;
+      return pack(...mapped(given, position(given, full, sum / channels)));
+    };
+  }
+
   function drawPanel({ rect, image, reference, map, full, factor, tone, zoom, origin }) {
     const left = Math.max(rect.x, Math.floor(origin.x));
     const top = Math.max(rect.y, Math.floor(origin.y));
@@ -15,43 +49,16 @@ progden.canvas2d = (canvas) => {
     const drawn = context.createImageData(right - left, bottom - top);
     const column = (x) => Math.floor((x + 0.5 - origin.x) / zoom);
     const row = (y) => Math.floor((y + 0.5 - origin.y) / zoom);
-    // All exposed and toned bytes of a half float: far fewer than there are pixels.
-    const scale = image.scale * factor;
-    const bytes = map === "image" && Uint8ClampedArray.from(
-      floats, (v) => 255 * toSrgb(TONES[tone].apply(Math.max(v * scale, 0))));
-    const { channels, halves } = image;
-    const given = MAPS[map];
-    const value = (of, at, channel) =>
-      floats[of.halves[of.channels === 1 ? at : 3 * at + channel]] * of.scale;
-
-    function colour(at) {
-      const last = channels === 1 ? 0 : 2;
-      let sum = 0;
-      for (let channel = 0; channel <= last; channel++) {
-        const z = value(image, at, channel);
-        sum += given.error ? given.error(z, value(reference, at, channel)) : z;
-      }
-      if (!Number.isFinite(sum)) return BAD;
-      return mapped(given, position(given, full, sum / (last + 1)));
-    }
-    function picture(at) {
-      const triple = [0, 1, 2].map((c) => halves[channels === 1 ? at : 3 * at + c]);
-      return triple.every((half) => Number.isFinite(floats[half]))
-        ? triple.map((half) => bytes[half])
-        : BAD;
-    }
-
-    const of = bytes ? picture : colour;
+    const colorAt = map === "image" ? picture(image, factor, tone) : mapOf(image, reference, map, full);
+    const bytes = new Uint32Array(drawn.data.buffer);
     for (let y = top, to = 0; y < bottom; y++) {
       const j = row(y);
-      let before = -1;
-      let rgb = BAD;
-      for (let x = left; x < right; x++, to += 4) {
+      for (let x = left, before = -1, packed = 0; x < right; x++, to++) {
         const i = column(x);
         if (i < 0 || j < 0 || i >= image.width || j >= image.height) continue;
-        if (i !== before) rgb = of(j * image.width + i);
+        if (i !== before) packed = colorAt(j * image.width + i);
         before = i;
-        drawn.data.set([rgb[0], rgb[1], rgb[2], 255], to);
+        bytes[to] = packed;
       }
     }
     context.putImageData(drawn, left, top);

@@ -150,6 +150,8 @@
   });
   byId("methods").replaceChildren(...chips.map(([, chip]) => chip));
 
+  let listedSpps = "";
+
   function update() {
     // A link may name samples that its scene does not have.
     const known = results.sppsOf(values.scene);
@@ -168,7 +170,10 @@
       chip.setAttribute("aria-pressed", pressed);
       chip.hidden = method === REFERENCE && !flipping;
     }
-    setOptions(controls.spp, known.map((spp) => [spp, `${spp} spp`]));
+    if (known.join() !== listedSpps) {
+      listedSpps = known.join();
+      setOptions(controls.spp, known.map((spp) => [spp, `${spp} spp`]));
+    }
     for (const name of ["scene", "spp", "map", "tone", "metric", "rows"]) controls[name].value = values[name];
     controls.tableMetric.value = values.metric;
     controls.baseline.value = values.baseline ?? "";
@@ -197,7 +202,7 @@
     if (!map.colors) return byId("legend").replaceChildren();
     const full = map.full(2 ** (data.scenes[values.scene].exposure + values.exposure));
     const stops = Array.from({ length: 33 }, (_, i) => `rgb(${color.mapped(map, i / 32).join(" ")})`);
-    const parts = map.steep ? [1, 0.1, 0.01, 0] : [1, 0.5, 0];
+    const parts = map.steep ? [1, map.steep ** -0.5, 0] : [1, 0.5, 0];
     const signed = map.signed ? parts.filter((part) => part).map((part) => -part) : [];
     const ticks = [...parts, ...signed].map((part) => element(
       "span", { style: `left:${100 * color.position(map, full, part * full)}%` }, number(part * full)));

@@ -35,14 +35,14 @@ progden.page = (() => {
     made.replaceChildren(...options.map(([value, text]) => element("option", { value }, text)));
   }
 
-  /** A number as tables and labels show it: about three digits. */
+  /** A number as tables and labels show it, in three digits. */
   function number(value) {
     if (value === null || value === undefined) return "–";
     if (!Number.isFinite(value)) return String(value);
     const size = Math.abs(value);
-    if (size !== 0 && (size < 1e-3 || size >= 1e5)) return value.toExponential(2).replace("-", "−");
-    const digits = size === 0 ? 1 : Math.min(4, Math.max(0, 3 - Math.floor(Math.log10(size)) - 1));
-    return value.toFixed(Math.max(digits, size < 100 ? 2 : 0)).replace("-", "−");
+    if (size === 0) return "0";
+    if (size < 1e-3 || size >= 1e5) return value.toExponential(2).replace("-", "−");
+    return (size >= 1000 ? value.toFixed(0) : value.toPrecision(3)).replace("-", "−");
   }
 
   /** How plots and labels tell methods apart: a colour of the scheme, a marker, a dash. */

@@ -109,7 +109,8 @@ progden.plots = (() => {
   let drawnFor = "";
 
   function draw({ metric, baseline }) {
-    const now = JSON.stringify([metric, baseline, state.shown()]);
+    const width = Math.min(760, Math.max(300, byId("mean-plot").clientWidth));
+    const now = JSON.stringify([metric, baseline, state.shown(), width]);
     if (now === drawnFor) return;
     drawnFor = now;
     const { label } = data.metrics.find(({ name }) => name === metric);
@@ -130,7 +131,7 @@ progden.plots = (() => {
     const over = data.scenes.length === 1 ? "1 scene" : `${data.scenes.length} scenes`;
     const title = `Geometric mean over ${over}` +
       (relative && data.scenes.length > 1 ? `, with its ${percent} % interval` : "");
-    byId("mean-plot").replaceChildren(plot(means, { title, unit, width: 760, height: 420, line }));
+    byId("mean-plot").replaceChildren(plot(means, { title, unit, width, height: Math.min(420, 0.7 * width), line }));
     byId("scene-plots").replaceChildren(...data.scenes.map((scene, index) => {
       const series = methods.map((method) => ({
         method,
@@ -144,5 +145,6 @@ progden.plots = (() => {
     }));
   }
 
+  new ResizeObserver(state.notify).observe(byId("mean-plot"));
   return { draw };
 })();

@@ -40,7 +40,10 @@ progden.tables = (() => {
     },
     settings() {
       const names = [...new Set(data.methods.flatMap(({ settings }) => Object.keys(settings)))].sort();
-      const text = (value) => (value === undefined || typeof value === "string" ? value : JSON.stringify(value));
+      const text = (value) => {
+        if (value === null) return "–";
+        return value === undefined || typeof value === "string" ? value : JSON.stringify(value);
+      };
       const rows = data.methods.map(({ name, settings }, index) => ({
         method: name, index,
         ...Object.fromEntries(names.map((n) => [`set ${n}`, text(settings[n])])),

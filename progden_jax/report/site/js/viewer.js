@@ -86,10 +86,16 @@ progden.viewer = (() => {
     return zoom >= 1 ? Math.floor(zoom) : zoom;
   }
 
+  function resize() {
+    const width = Math.max(1, Math.round(stage.clientWidth * devicePixelRatio));
+    const height = Math.max(1, Math.round(stage.clientHeight * devicePixelRatio));
+    if (canvas.width !== width) canvas.width = width;
+    if (canvas.height !== height) canvas.height = height;
+  }
+
   function draw() {
     if (!renderer) start();
-    canvas.width = Math.max(1, Math.round(stage.clientWidth * devicePixelRatio));
-    canvas.height = Math.max(1, Math.round(stage.clientHeight * devicePixelRatio));
+    resize();
     const loaded = entries().map((method) => {
       const { picture, reference, map, missing } = wanted(method);
       const found = picture ? images.get(picture) : { state: missing };
@@ -175,8 +181,9 @@ progden.viewer = (() => {
   }
 
   function slotAt(x, y) {
+    const strip = STRIP * devicePixelRatio;
     const within = ({ rect }) =>
-      x >= rect.x && y >= rect.y - STRIP && x < rect.x + rect.width && y < rect.y + rect.height;
+      x >= rect.x && y >= rect.y - strip && x < rect.x + rect.width && y < rect.y + rect.height;
     return view?.slots.find(within) ?? view?.slots[0];
   }
 
