@@ -1,6 +1,6 @@
 "use strict";
 
-/* Draws panels without WebGL, pixel by pixel: the same pictures, but slower, and shrunk ones unsmoothed. */
+/* Draws panels without WebGL: the same pictures, but another exposure takes a moment. */
 progden.canvas2d = (canvas) => {
   const { TONES, MAPS, toSrgb, position, mapped, BAD } = progden.color;
   const { floats } = progden.images;
@@ -40,28 +40,34 @@ progden.canvas2d = (canvas) => {
     };
   }
 
-  function drawPanel({ rect, image, reference, map, full, factor, tone, zoom, origin }) {
-    const left = Math.max(rect.x, Math.floor(origin.x));
-    const top = Math.max(rect.y, Math.floor(origin.y));
-    const right = Math.min(rect.x + rect.width, Math.ceil(origin.x + image.width * zoom));
-    const bottom = Math.min(rect.y + rect.height, Math.ceil(origin.y + image.height * zoom));
-    if (right <= left || bottom <= top) return;
-    const drawn = context.createImageData(right - left, bottom - top);
-    const column = (x) => Math.floor((x + 0.5 - origin.x) / zoom);
-    const row = (y) => Math.floor((y + 0.5 - origin.y) / zoom);
+  const painted = new WeakMap(); // image -> {as, drawn}, so that zoom and pan need no computing
+
+  /** A canvas of the image's own size, its colours under these settings. */
+  function paint({ image, reference, map, full, factor, tone }) {
+    const as = [reference?.name, map, full, factor, tone].join();
+    const known = painted.get(image);
+    if (known?.as === as) return known.drawn;
+    const drawn = known?.drawn ?? document.createElement("canvas");
+    [drawn.width, drawn.height] = [image.width, image.height];
+    const pixels = new ImageData(image.width, image.height);
+    const bytes = new Uint32Array(pixels.data.buffer);
     const colorAt = map === "image" ? picture(image, factor, tone) : mapOf(image, reference, map, full);
-    const bytes = new Uint32Array(drawn.data.buffer);
-    for (let y = top, to = 0; y < bottom; y++) {
-      const j = row(y);
-      for (let x = left, before = -1, packed = 0; x < right; x++, to++) {
-        const i = column(x);
-        if (i < 0 || j < 0 || i >= image.width || j >= image.height) continue;
-        if (i !== before) packed = colorAt(j * image.width + i);
-        before = i;
-        bytes[to] = packed;
-      }
-    }
-    context.putImageData(drawn, left, top);
+    for (let index = 0; index < bytes.length; index++) bytes[index] = colorAt(index);
+    drawn.getContext("2d").putImageData(pixels, 0, 0);
+    painted.set(image, { as, drawn });
+    return drawn;
+  }
+
+  function drawPanel(panel) {
+    const { rect, image, zoom, origin } = panel;
+    context.save();
+    context.beginPath();
+    context.rect(rect.x, rect.y, rect.width, rect.height);
+    context.clip();
+    context.imageSmoothingEnabled = zoom < 1;
+    context.imageSmoothingQuality = "medium";
+    context.drawImage(paint(panel), origin.x, origin.y, image.width * zoom, image.height * zoom);
+    context.restore();
   }
 
   return {
@@ -71,6 +77,6 @@ progden.canvas2d = (canvas) => {
       context.clearRect(0, 0, canvas.width, canvas.height);
       panels.forEach(drawPanel);
     },
-    forget() {},
+    forget: (image) => painted.delete(image),
   };
 };

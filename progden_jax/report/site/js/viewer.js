@@ -36,8 +36,9 @@ progden.viewer = (() => {
   }
 
   function start() {
-    renderer = null;
-    if (!new URLSearchParams(location.search).has("canvas")) renderer = progden.webgl(canvas);
+    // ?canvas and ?webgl choose, for those who look for a fault.
+    const asked = new URLSearchParams(location.search);
+    renderer = asked.has("canvas") ? null : progden.webgl(canvas, asked.has("webgl"));
     if (!renderer) useCanvas();
     canvas.addEventListener("webglcontextlost", useCanvas);
     stage.dataset.renderer = renderer.name;

@@ -2,10 +2,14 @@
 
 /* Draws panels with WebGL 2: half floats go to the card as they are, so that exposure, tone curve, zoom
    and maps cost nothing but a redraw. */
-progden.webgl = (canvas) => {
+progden.webgl = (canvas, evenSlow) => {
   const { TONES, MAPS, colormaps } = progden.color;
   const gl = canvas.getContext("webgl2", { antialias: false, preserveDrawingBuffer: true });
   if (!gl) return null;
+  // WebGL in software is slower than none: Chromium's, Mesa's and Windows' are.
+  const info = gl.getExtension("WEBGL_debug_renderer_info");
+  const card = gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
+  if (!evenSlow && /swiftshader|llvmpipe|softpipe|software|basic render/i.test(card)) return null;
 
   const names = Object.keys(MAPS);
   const tones = Object.keys(TONES);
