@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-# Tried on a 1920×1080 render, size of the script file and time until it can be drawn in Chromium on two slow
-# cores: TODO
+# Tried on a 1920×1080 render at 32 spp, in MB of the script file: halves deflated as they are 7.7, their high
+# bytes before the low ones 6.6, differences of them 6.4 (5.0 where it is smooth), RGBE 4.3, which has no
+# negative values and two digits. Chromium decodes 6.4 MB in 0.16 s on one busy core, most of it inflating.
 _LEVEL = 6
 _LARGEST = 15
 
