@@ -113,15 +113,14 @@ def read_layers(path: PathLike) -> dict[str, np.ndarray]:
         If the file is damaged.
     """
     part = load(path)[0]
-    found = {}
-    for components in ("RGB", "Y"):
-        for name in part.channels:
-            layer, dot, component = name.rpartition(".")
-            names = [layer + dot + c for c in components]
-            if component == components[0] and all(n in part.channels for n in names):
-                planes = [part.channels[n].pixels for n in names]
-                if all(p is not None and p.shape == part.size for p in planes):
-                    found[layer] = np.stack(planes, axis=-1).astype(np.float32, copy=False)
+    found: dict[str, np.ndarray] = {}
+    for layer in dict.fromkeys(name.rpartition(".")[0] for name in part.channels):
+        for components in ("RGB", "Y"):
+            names = [f"{layer}.{c}" if layer else c for c in components]
+            planes = [part.channels[n].pixels for n in names if n in part.channels]
+            full = [p for p in planes if p is not None and p.shape == part.size]
+            if len(full) == len(components):
+                found.setdefault(layer, np.stack(full, axis=-1).astype(np.float32, copy=False))
     return found
 
 

@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -190,7 +190,7 @@ class _Gathered:
         color = self._read(row.render, _color) if row.method == "render" else None
         return {} if color is None else {"": color}
 
-    def _flip(self, image: np.ndarray, reference: np.ndarray, row: Row) -> str | None:
+    def _flip(self, image: Any, reference: Any, row: Row) -> str | None:
         if self._which_flip == "none":
             return None
         if self._which_flip == "auto" and image.shape[0] * image.shape[1] > _FLIP_PIXELS:
