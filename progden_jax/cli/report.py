@@ -25,6 +25,7 @@ _WARNINGS_TOLD = 10
 
 def report(
     run: Annotated[Path, Parameter(name="RUN", help="The folder that holds results.sqlite.")],
+    /,
     *,
     output: Annotated[
         Path, Parameter(name=["--output", "-o"], help="The folder of the page, made if missing.")

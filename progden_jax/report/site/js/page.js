@@ -41,7 +41,7 @@ progden.page = (() => {
     if (!Number.isFinite(value)) return String(value);
     const size = Math.abs(value);
     if (size === 0) return "0";
-    if (size < 1e-3 || size >= 1e5) return value.toExponential(2).replace("-", "−");
+    if (size < 1e-3 || size >= 1e5) return value.toExponential(2).replaceAll("-", "−");
     return (size >= 1000 ? value.toFixed(0) : value.toPrecision(3)).replace("-", "−");
   }
 
