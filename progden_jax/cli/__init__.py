@@ -18,6 +18,8 @@ from progden_jax.cli.info import HELP as INFO_HELP
 from progden_jax.cli.info import info
 from progden_jax.cli.render import HELP as RENDER_HELP
 from progden_jax.cli.render import render
+from progden_jax.cli.report import HELP as REPORT_HELP
+from progden_jax.cli.report import report
 from progden_jax.cli.train import app as train
 
 app = App(
@@ -33,6 +35,7 @@ app = App(
 _COMMANDS = {
     "denoise": (denoise, "IN... -o OUT [OPTIONS]", DENOISE_HELP),
     "info": (info, "IN... [OPTIONS]", INFO_HELP),
+    "report": (report, "RUN -o SITE [OPTIONS]", REPORT_HELP),
     "demo": (demo, "[OPTIONS]", DEMO_HELP),
     "render": (render, "[SCENE...] -o OUT [OPTIONS]", RENDER_HELP),
     "devices": (devices, "[OPTIONS]", DEVICES_HELP),

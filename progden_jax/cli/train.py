@@ -1,12 +1,13 @@
 """`progden train`: weights from renders."""
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Parameter
 
+from progden_jax.cli._progress import counting
 from progden_jax.cli._run import OK, UsageError, print_json, show
 
 if TYPE_CHECKING:
@@ -131,7 +132,7 @@ def _train(
     if until is not None and until < 1:
         raise UsageError(f"--until is {until}, expected a step from 1 up.")
     enable_compilation_cache()
-    with _loading() as progress:
+    with counting("renders, denoised") as progress:
         task = make(progress)
     with contextlib.closing(_Report(quiet=json)) as report:
         outcome = train(task, output, report=report, until=until)
@@ -151,18 +152,6 @@ def _train(
     else:
         print(f"step {step}; no evaluation yet")
     return OK
-
-
-@contextlib.contextmanager
-def _loading() -> Iterator[Callable[[int, int], None]]:
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-
-    console = Console(stderr=True)
-    columns = (TextColumn("renders, denoised"), BarColumn(), MofNCompleteColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as p:
-        bar = p.add_task("", total=None)
-        yield lambda done, total: p.update(bar, completed=done, total=total)
 
 
 class _Report:

@@ -9,7 +9,7 @@ message names the remedy as a keyword and as the command line's flag.
 from progden_jax.exr._file import ExrError
 from progden_jax.exr._info import ChannelInfo, ExrInfo, PartInfo, RoleInfo, Values
 from progden_jax.exr._map import parse_channel_map
-from progden_jax.exr._read import describe_exr, read_exr, read_exr_with_info
+from progden_jax.exr._read import describe_exr, read_exr, read_exr_with_info, read_layers
 from progden_jax.exr._render import Settings
 from progden_jax.exr._statistics import MEANINGS
 from progden_jax.exr._write import COMPRESSIONS, write_exr
@@ -28,5 +28,6 @@ __all__ = [
     "parse_channel_map",
     "read_exr",
     "read_exr_with_info",
+    "read_layers",
     "write_exr",
 ]

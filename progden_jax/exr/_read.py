@@ -4,9 +4,11 @@ import logging
 from collections.abc import Sequence
 from typing import Unpack
 
+import numpy as np
+
 from progden_jax._numeric import adopted
 from progden_jax.exr._channels import require
-from progden_jax.exr._file import ExrError
+from progden_jax.exr._file import ExrError, load
 from progden_jax.exr._info import ExrInfo, RoleInfo, part_info, role_info
 from progden_jax.exr._map import ChannelMap
 from progden_jax.exr._names import AUXILIARY, Missing, Source
@@ -96,6 +98,30 @@ def read_exr_with_info(path: PathLike, **settings: Unpack[Settings]) -> tuple[Fr
         if isinstance(render.roles[role], Source):
             buffers[role] = adopted(render.image(role))
     return Frame(**buffers, spp=spp), _info(render, text, spp, statistics=False)
+
+
+def read_layers(path: PathLike) -> dict[str, np.ndarray]:
+    """The image and the named layers of a file as `write_exr` makes it, float32.
+
+    Returns
+    -------
+    Layer -> (H, W, 3), the image itself under "", or (H, W, 1) for layers of one channel Y.
+
+    Raises
+    ------
+    ExrError
+        If the file is damaged.
+    """
+    part = load(path)[0]
+    found: dict[str, np.ndarray] = {}
+    for layer in dict.fromkeys(name.rpartition(".")[0] for name in part.channels):
+        for components in ("RGB", "Y"):
+            names = [f"{layer}.{c}" if layer else c for c in components]
+            planes = [part.channels[n].pixels for n in names if n in part.channels]
+            full = [p for p in planes if p is not None and p.shape == part.size]
+            if len(full) == len(components):
+                found.setdefault(layer, np.stack(full, axis=-1).astype(np.float32, copy=False))
+    return found
 
 
 def describe_exr(path: PathLike, **settings: Unpack[Settings]) -> ExrInfo:
