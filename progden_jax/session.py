@@ -166,9 +166,10 @@ class Session:
 
     def _split(self, buffers: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
         """Buffers whose memory becomes the outputs', and the others."""
-        given = [name for name in buffers if name != "depth"][: len(self._job.outputs)]
-        kept = {name: buffer for name, buffer in buffers.items() if name not in given}
-        return {name: buffers[name] for name in given}, kept
+        # In the order of names, for jit gives dictionaries back sorted.
+        given = [name for name in self._names if name != "depth"][: len(self._job.outputs)]
+        kept = [name for name in self._names if name not in given]
+        return {n: buffers[n] for n in given}, {n: buffers[n] for n in kept}
 
     def _windows(self, active: np.ndarray, tile: int) -> list[Window] | None:
         """Around what is noisy; None: the whole frame."""

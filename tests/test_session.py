@@ -85,14 +85,21 @@ def test_the_whole_frame_until_the_windows_program_is_there(growing, denoiser):
     assert_same(first.image, second.image)
 
 
-def test_bad_pixels_and_every_output(real_frame, denoiser):
-    color = np.array(real_frame.color)[:50, :70]
-    color[3, 4], color[9, 9, 1] = np.nan, -1
-    frame = pd.Frame(color, np.asarray(real_frame.variance)[:50, :70])
-    session = pd.Session(denoiser, (50, 70), mixer=pd.ClosedForm(), outputs=pd.pipeline.OUTPUTS)
+@pytest.mark.parametrize("outputs", [("alpha",), pd.pipeline.OUTPUTS])
+def test_bad_pixels_auxiliary_buffers_and_every_output(real_frame, outputs):
+    buffers = {
+        name: np.array(getattr(real_frame, name))[:50, :70]
+        for name in ("color", "variance", "albedo", "normal", "depth")
+    }
+    buffers["color"][3, 4], buffers["color"][9, 9, 1] = np.nan, -1
+    frame = pd.Frame(**buffers)
+    denoiser = pd.denoisers.KPCN.init(
+        jax.random.key(0), inputs=("albedo", "normal"), layers=1, width=4
+    )
+    session = pd.Session(denoiser, (50, 70), mixer=pd.ClosedForm(), outputs=outputs)
     found = session.update(frame)
     expected = pd.progressive_denoise(frame, denoiser, mixer=pd.ClosedForm())
-    for name in pd.pipeline.OUTPUTS:
+    for name in outputs:
         np.testing.assert_allclose(
             getattr(found, name), getattr(expected, name), rtol=1e-5, atol=1e-6, err_msg=name
         )
