@@ -175,16 +175,17 @@ def print_plan(plan: "Plan", *, json: bool) -> None:
     from rich.table import Table
 
     columns = list(dict.fromkeys(name for method in methods for name in method))
-    # Settings that all share are no columns but a line.
-    varied = [c for c in columns if len({str(m.get(c)) for m in methods}) > 1 or c == "method"]
+    # What all that have a setting share needs no column.
+    values = {c: {str(m[c]) for m in methods if c in m} for c in columns}
+    varied = [c for c in columns if len(values[c]) > 1 or c == "method"]
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     for name in varied:
         table.add_column(name, overflow="fold")
     for method in methods:
         table.add_row(*(str(method.get(name, "")) for name in varied))
     tables().print(table, markup=False)
-    if shared := [f"{c}={methods[0][c]}" for c in columns if c not in varied]:
-        print(f"all: {', '.join(shared)}")
+    if shared := [f"{c}={v}" for c in columns if c not in varied for v in values[c]]:
+        print(f"the same in all that have it: {', '.join(shared)}")
     print(f"{len(methods)} methods × {items} renders = {total} rows")
 
 
