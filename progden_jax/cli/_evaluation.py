@@ -12,7 +12,7 @@ from progden_jax.cli._run import FAILED, OK, UsageError, complain, print_json, t
 if TYPE_CHECKING:
     from progden_jax.evaluation import Plan, Row
     from progden_jax.evaluation.dispatch import Workers
-    from progden_jax.evaluation.export import Summary
+    from progden_jax.evaluation.exports import Summary
     from progden_jax.evaluation.measure import Job
 
 
@@ -99,7 +99,7 @@ class ResultOptions:
 
     def check(self) -> None:
         """Raise UsageError for what is wrong whatever the files hold."""
-        from progden_jax.evaluation.export import check_path
+        from progden_jax.evaluation.exports import check_path
 
         if not 0 < self.confidence < 1:
             raise UsageError(f"--confidence is {self.confidence:g}, expected a share below 1.")
@@ -119,7 +119,7 @@ class ResultOptions:
     def show(self, run: Path, **facts: Any) -> None:
         """The run's tables, on stdout and into the files asked for."""
         from progden_jax.evaluation import export, rows
-        from progden_jax.evaluation.export import summary
+        from progden_jax.evaluation.exports import summary
 
         found = rows(run)
         if not found:

@@ -90,7 +90,7 @@ def dispatch(jobs: Sequence[Job], workers: Workers) -> Iterator[tuple[Job, Outco
         left = [program for program, queue in queues.items() if queue]
         if not left:
             return
-        if last.get(worker) not in left:
+        if worker not in last or last[worker] not in left:
             free = [program for program in left if program not in last.values()]
             last[worker] = max(free or left, key=lambda program: len(queues[program]))
         doing[worker] = queues[last[worker]].popleft()
