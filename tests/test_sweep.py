@@ -25,7 +25,7 @@ SMOKE = Path(__file__).parents[1] / "experiments" / "sweeps" / "smoke.yaml"
 
 @pytest.fixture(scope="module")
 def renders(tmp_path_factory) -> Path:
-    return write_series(tmp_path_factory.mktemp("series") / "renders")
+    return write_series(tmp_path_factory.mktemp("series") / "renders", SCENES)
 
 
 @pytest.fixture
@@ -194,8 +194,9 @@ def test_a_lost_job_is_done_again_but_not_for_ever():
     assert "3 workers were lost on it, the last one because of the script" in outcome.reason
 
 
-CONFIG = f"base: {{denoiser: {TOY}, image: denoised}}\ngrid: {{seed: [0, 1, 2]}}\n"
-ROWS = 3 * 2 * len(SPP)
+CONFIG = f"base: {{denoiser: {TOY}, estimator: none}}\nlist: [render, denoised]\n"
+SCENES = 3
+ROWS = 2 * SCENES * len(SPP)
 
 
 def check(run: Path) -> None:
@@ -212,7 +213,7 @@ def test_a_killed_process_costs_no_row(config, tmp_path):
     report = Remembers(kill)
     plan = evaluation.load(config(CONFIG))
     run = tmp_path / "run"
-    done = evaluation.carry_out(plan, run, report=report, workers=lambda jobs: Processes(2))
+    done = evaluation.carry_out(plan, run, report=report, workers=lambda jobs: Processes(1))
     assert done == (ROWS, 0, 0)
     check(run)
     assert multiprocessing.active_children() == []

@@ -1,6 +1,9 @@
 """Workers that are actors of a Ray cluster, on one machine or several."""
 
+import contextlib
 import os
+import sys
+import warnings
 from typing import Any
 
 from progden_jax import enable_compilation_cache
@@ -42,14 +45,17 @@ class Cluster:
             ) from None
         self._ray = ray
         try:
-            ray.init(
-                address=address or "local",
-                include_dashboard=None if address else False,
-                configure_logging=False,
-                log_to_driver=False,
-            )
+            with warnings.catch_warnings():
+                # JAX warns of forks; Ray's are of other programs.
+                warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called")
+                ray.init(
+                    address=address or "local",
+                    include_dashboard=None if address else False,
+                    configure_logging=False,
+                    log_to_driver=False,
+                )
         except (ConnectionError, RuntimeError, ValueError) as error:
-            raise ValueError(f"no Ray cluster at {address}: {error}") from None
+            raise ValueError(f"no Ray cluster at {address or 'this machine'}: {error}") from None
         have = ray.cluster_resources()
         room = int(have.get("GPU", 0) / gpus) if gpus else int(have.get("CPU", 0))
         if room < 1:
@@ -62,6 +68,9 @@ class Cluster:
         self._arguments = (cache,)
         self._actors = [self._start() for _ in range(self.count)]
         self._busy: dict[Any, int] = {}
+        # Where Ray tells of lost workers, but results go.
+        self._stdout = contextlib.redirect_stdout(sys.stderr)
+        self._stdout.__enter__()
 
     def give(self, worker: int, job: Job) -> None:
         self._busy[self._actors[worker].attempt.remote(job)] = worker
@@ -79,6 +88,7 @@ class Cluster:
         for actor in self._actors:
             self._ray.kill(actor)
         self._ray.shutdown()
+        self._stdout.__exit__(None, None, None)
 
     def _start(self) -> Any:
         return self._class.remote(*self._arguments)

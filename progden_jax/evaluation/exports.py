@@ -148,22 +148,20 @@ def _pyarrow() -> tuple[Any, Any]:
     return pyarrow, pyarrow.parquet
 
 
-def _counts(table: Table) -> str:
+def _note(table: Table, confidence: float) -> str:
+    """Over how many scenes, and what the intervals are, where there can be any."""
     counts = sorted({i.count for by_spp in table.values() for i in by_spp.values()})
-    return "–".join(str(n) for n in dict.fromkeys((counts[0], counts[-1])))
-
-
-def _note(confidence: float) -> str:
-    return f"{confidence:.0%} confidence intervals by Student's t"
+    if counts == [1]:
+        return "of one scene"
+    scenes = "–".join(str(n) for n in dict.fromkeys((counts[0], counts[-1])))
+    return f"means over {scenes} scenes, {confidence:.0%} confidence intervals by Student's t"
 
 
 def _markdown(tables: Sequence[Summary], confidence: float) -> str:
     parts = []
     for found in tables:
-        scenes = _counts(found.table)
         lines = [
-            f"## {found.title}\n",
-            f"Means over {scenes} scenes, {_note(confidence)}.\n",
+            f"## {found.title}, {_note(found.table, confidence)}\n",
             "| method | " + " | ".join(f"{n} spp" for n in found.spps) + " |",
             "| --- |" + " ---: |" * len(found.spps),
         ]
@@ -197,8 +195,7 @@ def _latex(tables: Sequence[Summary], confidence: float) -> str:
     out = io.StringIO()
     out.write("% Needs \\usepackage{booktabs}.\n")
     for found in tables:
-        scenes = _counts(found.table)
-        caption = f"{found.title}: means over {scenes} scenes, {_note(confidence)}."
+        caption = f"{found.title}, {_note(found.table, confidence)}."
         heads = " & ".join(str(n) for n in found.spps)
         out.write(
             "\\begin{table}\n  \\centering\n"
