@@ -39,7 +39,7 @@ def _compilations() -> list[str]:
     """Grows by a name with each program that is compiled, or read from the cache, from now on."""
     names: list[str] = []
 
-    def listen(event: str, _: float, **details: Any) -> None:
+    def listen(event: str, duration_secs: float, **details: Any) -> None:
         if event == "/jax/core/compile/backend_compile_duration":
             names.append(str(details.get("fun_name", "")))
 

@@ -263,7 +263,7 @@ def test_the_command_shows_and_exports_what_is_there(run, tmp_path, capsys):
     assert out.read_text().count("## ") == 7
     assert main(["evaluate", "-o", str(folder), "--json", "--baseline", "render"]) == 0
     told = json.loads(capsys.readouterr().out)
-    assert told["means"]["rmse"]["render"]["4"] == {"mean": 1.0, "half": 0.0, "count": 2}
+    assert told["means"]["rmse"]["render"]["4"] == {"mean": 1.0, "half": 0.0, "scenes": 2}
 
 
 @pytest.mark.parametrize(

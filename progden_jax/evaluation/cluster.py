@@ -1,6 +1,7 @@
 """Workers that are actors of a Ray cluster, on one machine or several."""
 
 import contextlib
+import importlib
 import os
 import sys
 import warnings
@@ -38,7 +39,7 @@ class Cluster:
     ) -> None:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         try:
-            import ray
+            ray: Any = importlib.import_module("ray")
         except ImportError:
             raise ValueError(
                 "Ray is not installed: pip install 'progden_jax[sweep]', or leave --ray and --address out."

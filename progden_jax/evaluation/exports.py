@@ -1,6 +1,7 @@
 """Results for other programs (CSV, Parquet) and for papers (Markdown, LaTeX)."""
 
 import csv
+import importlib
 import io
 import math
 from collections.abc import Sequence
@@ -139,18 +140,16 @@ def _write_parquet(path: Path, rows: Sequence[Row]) -> None:
 
 def _pyarrow() -> tuple[Any, Any]:
     try:
-        import pyarrow
-        import pyarrow.parquet
+        return importlib.import_module("pyarrow"), importlib.import_module("pyarrow.parquet")
     except ImportError:
         raise ValueError(
             "writing Parquet needs PyArrow: pip install 'progden_jax[evaluate]', or export .csv."
         ) from None
-    return pyarrow, pyarrow.parquet
 
 
 def _note(table: Table, confidence: float) -> str:
     """Over how many scenes, and what the intervals are, where there can be any."""
-    counts = sorted({i.count for by_spp in table.values() for i in by_spp.values()})
+    counts = sorted({i.scenes for by_spp in table.values() for i in by_spp.values()})
     if counts == [1]:
         return "of one scene"
     scenes = "–".join(str(n) for n in dict.fromkeys((counts[0], counts[-1])))

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import numpy as np
@@ -160,8 +160,8 @@ def _estimate(frame: pd.Frame, settings: Settings, max_memory: int | None) -> _E
             max_memory=max_memory,
         )
     )
-    images = (np.asarray(a) for a in (found.denoised, found.divergence, found.sure))
-    return _Estimate(denoiser, *images, seconds)
+    denoised, divergence, risk = map(np.asarray, (found.denoised, found.divergence, found.sure))
+    return _Estimate(denoiser, denoised, divergence, risk, seconds)
 
 
 @jax.tree_util.register_dataclass
@@ -200,7 +200,7 @@ def _show(settings: Settings, frame: pd.Frame, estimate: _Estimate | None) -> _S
             _Known(estimate.denoised),
             mixer=parts.mixer_for(estimate.denoiser, settings),
             bound=settings.limits if settings.bound else False,
-            divergence=estimate.divergence,
+            divergence=cast(Any, estimate.divergence),
             outputs=("image", "alpha"),
             skip=False,
         )
@@ -231,7 +231,7 @@ def _row(cell: Cell, pair: _Pair, estimate: _Estimate | None, run: Path | None) 
     if not np.isfinite(image).all():
         raise ValueError(f"{cell.item.path}: the result of {cell.method.label!r} is not finite.")
     scores = {name: float(v) for name, v in _scores(image, pair.reference).items()}
-    scores["flip"] = metrics.flip(image, pair.reference)
+    scores["flip"] = metrics.flip(cast(Any, image), cast(Any, pair.reference))
     of = estimate if settings.image != "render" else None
     kept = None
     if run is not None:

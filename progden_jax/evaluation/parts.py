@@ -4,7 +4,7 @@ import functools
 import importlib.util
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -51,10 +51,10 @@ def load_denoiser(name: str, precision: str) -> Denoiser:
     path, colon, attribute = name.rpartition(":")
     if not colon or not path.endswith(".py"):
         return denoisers.load(name, precision=precision)
-    found = getattr(_module(Path(path)), attribute, None)
+    found: Any = getattr(_module(Path(path)), attribute, None)
     if not callable(found):
         raise ValueError(f"{name}: {path} has no function or denoiser {attribute!r}.")
-    return found if isinstance(found, Denoiser) else FunctionDenoiser(found)
+    return found if isinstance(found, Denoiser) else FunctionDenoiser(cast(Any, found))
 
 
 def content(settings: Settings) -> str:

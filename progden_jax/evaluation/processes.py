@@ -6,6 +6,7 @@ import os
 import signal
 from collections.abc import Sequence
 from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import cast
 
@@ -62,9 +63,9 @@ class Processes:
             process.join()
             pipe.close()
 
-    def _start(self, worker: int) -> tuple[multiprocessing.process.BaseProcess, Connection]:
+    def _start(self, worker: int) -> tuple[BaseProcess, Connection]:
         ours, theirs = self._context.Pipe()
-        cache = jax.config.jax_compilation_cache_dir
+        cache = jax.config.values["jax_compilation_cache_dir"]
         arguments = (theirs, self._cores[worker], self.count > 1, cache)
         process = self._context.Process(target=_serve, args=arguments, daemon=True)
         process.start()

@@ -29,7 +29,7 @@ class Interval(NamedTuple):
 
     mean: float
     half: float
-    count: int
+    scenes: int
 
 
 Table = dict[str, dict[int, Interval]]
@@ -94,7 +94,7 @@ def relative_to(
             logarithms.append(row._replace(**{metric: math.log(value / other)}))
     return {
         method: {
-            spp: Interval(math.exp(found.mean), math.exp(found.mean) * found.half, found.count)
+            spp: Interval(math.exp(found.mean), math.exp(found.mean) * found.half, found.scenes)
             for spp, found in by_spp.items()
         }
         for method, by_spp in means(logarithms, metric, confidence).items()
@@ -119,7 +119,7 @@ def sure_bias(rows: Iterable[Row], confidence: float = CONFIDENCE) -> Table:
             error = interval(sure - truth, confidence)
             size = float(truth.mean())
             if size > 0:
-                table[method][spp] = Interval(error.mean / size, error.half / size, error.count)
+                table[method][spp] = Interval(error.mean / size, error.half / size, error.scenes)
     return table
 
 
