@@ -43,14 +43,7 @@ class Seen(NamedTuple):
     sure: Float[Array, "h w 3"]
 
 
-class Bound(NamedTuple):
-    """Settings of the t-bound, see `progden_jax.t_bound`."""
-
-    window: int = 11
-    shift: bool = True
-
-
-BOUND = Bound()
+BOUND = pd.Bound()
 """The authors'."""
 
 
@@ -58,7 +51,7 @@ class Mix(NamedTuple):
     """A mixer, and the bound on its α; None: not bounded."""
 
     mixer: pd.Mixer
-    bound: Bound | None = BOUND
+    bound: pd.Bound | None = BOUND
 
 
 def parser(description: str | None, output: Path | None = None) -> argparse.ArgumentParser:
@@ -92,15 +85,15 @@ def look(
     return Seen(frame.color, y, frame.variance, divergence, risk)
 
 
-@functools.partial(jax.jit, static_argnames="bound")
+@jax.jit
 def mix(
-    seen: Seen, mixer: pd.Mixer, *, bound: Bound | None = BOUND
+    seen: Seen, mixer: pd.Mixer, *, bound: pd.Bound | None = BOUND
 ) -> tuple[Float[Array, "h w 3"], Float[Array, "h w 3"]]:
     """The mixed image and its α. Compiled once per structure of the mixer, whatever its weights."""
     x, y, variance, *_ = seen
     alpha = mixer(*seen)
     if bound is not None:
-        alpha = pd.t_bound(alpha, x, y, variance, window=bound.window, shift=bound.shift)
+        alpha = bound(alpha, x, y, variance)
     return x + alpha * (y - x), alpha
 
 

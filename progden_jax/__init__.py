@@ -30,9 +30,10 @@ from progden_jax.pipeline import Denoised, Result, denoise, progressive_denoise
 from progden_jax.session import Session
 from progden_jax.skipping import Skip, Skipped
 from progden_jax.sure import sure
-from progden_jax.tstatistic import t_bound
+from progden_jax.tstatistic import Bound, t_bound
 
 __all__ = [
+    "Bound",
     "ClosedForm",
     "Denoised",
     "Denoiser",

@@ -70,7 +70,7 @@ def _everywhere(leaf: Any, mesh: Mesh) -> jax.Array:
     if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
         data = _everywhere(jax.random.key_data(leaf), mesh)
         return jax.random.wrap_key_data(data, impl=jax.random.key_impl(leaf))
-    whole = np.asarray(leaf)
+    whole = np.asarray(leaf, jnp.result_type(leaf))
     sharding = NamedSharding(mesh, PartitionSpec())
     return jax.make_array_from_callback(whole.shape, sharding, lambda _: whole)
 

@@ -28,6 +28,7 @@ from progden_jax.pipeline import (
 )
 from progden_jax.skipping import Skip, Skipped, noisy_tiles
 from progden_jax.survey import BUFFERS
+from progden_jax.tstatistic import Bound
 
 Size = tuple[int, int]
 
@@ -47,6 +48,7 @@ def denoise_batch(
     *,
     mixer: Mixer | None = None,
     method: Method | None = None,
+    bound: Bound | bool = True,
     key: jax.Array | None = None,
     outputs: Sequence[str] = ("image",),
     skip: Skip | bool = True,
@@ -63,8 +65,8 @@ def denoise_batch(
     Parameters
     ----------
     frames : frames, or functions that read them, called on the threads; may be a generator.
-    denoiser, mixer, method, key, outputs, skip, max_memory : as for `progressive_denoise`; the same key for
-        all, so that each result is the one of a call of its own, to rounding.
+    denoiser, mixer, method, bound, key, outputs, skip, max_memory : as for `progressive_denoise`; the same
+        key for all, so that each result is the one of a call of its own, to rounding.
     sizes : (height, width) of every frame, where they are known beforehand but `frames` does not tell: then
         at most three programs serve them all. Of frames in a sequence they are taken. Else every
         size has that of its canvas.
@@ -85,9 +87,9 @@ def denoise_batch(
     if devices is None:
         devices = jax.local_devices()
     if len(devices) > 1 and max_memory is None:
-        job = job_of(denoiser, mixer, method, key, outputs)
+        job = job_of(denoiser, mixer, method, key, outputs, bound)
         read = _in_order(_read, frames, at_once * len(devices))
-        return _on_devices(read, job, rule_of(skip, job.outputs), canvases, devices)
+        return _on_devices(read, job, rule_of(skip, job), canvases, devices)
     first_of = Once()
 
     def run(given: Frame | Callable[[], Frame]) -> Result:
@@ -100,6 +102,7 @@ def denoise_batch(
                 denoiser,
                 mixer=mixer,
                 method=method,
+                bound=bound,
                 key=key,
                 outputs=outputs,
                 skip=skip,
@@ -145,7 +148,9 @@ def _on_devices(
         if has_canvas(job.denoiser):
             canvas = canvases.get(canvas_of(frame.size), canvas_of(frame.size))
         if rule is not None and not noisy_tiles(frame.color, variance, rule).any():
-            done[index] = progressive_denoise(frame, job.denoiser, outputs=job.outputs, skip=rule)
+            done[index] = progressive_denoise(
+                frame, job.denoiser, bound=job.bound or False, outputs=job.outputs, skip=rule
+            )
         else:
             kind = (canvas, *(getattr(frame, name) is None for name in BUFFERS))
             groups.setdefault(kind, []).append((index, frame, canvas))

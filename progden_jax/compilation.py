@@ -1,7 +1,9 @@
 """The persistent compilation cache: what is compiled once is not compiled again in the next run."""
 
+import functools
 import os
 from pathlib import Path
+from typing import Any
 
 import jax
 import platformdirs
@@ -30,3 +32,21 @@ def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Pa
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     return path
+
+
+@functools.cache
+def _compilations() -> list[str]:
+    """Grows by a name with each program that is compiled, or read from the cache, from now on."""
+    names: list[str] = []
+
+    def listen(event: str, duration_secs: float, **details: Any) -> None:
+        if event == "/jax/core/compile/backend_compile_duration":
+            names.append(str(details.get("fun_name", "")))
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    return names
+
+
+def count_compilations() -> int:
+    """How many programs this process compiled, or read from the cache, since the first call."""
+    return len(_compilations())

@@ -23,7 +23,7 @@ from progden_jax.mixing import Mixer
 from progden_jax.skipping import Skip, Skipped
 from progden_jax.sure import sure
 from progden_jax.survey import BUFFERS, crop, frame_of
-from progden_jax.tstatistic import t_bound
+from progden_jax.tstatistic import Bound
 
 DEFAULT_METHOD = MonteCarlo(probes=1)
 """One probe: averaging windows remove its noise, see experiments/main_job."""
@@ -78,6 +78,7 @@ def progressive_denoise(
     *,
     mixer: Mixer | None = None,
     method: Method | None = None,
+    bound: Bound | bool = True,
     key: jax.Array | None = None,
     divergence: Float[Array, "h w 3"] | None = None,
     outputs: Sequence[str] | None = None,
@@ -99,6 +100,8 @@ def progressive_denoise(
     mixer : gives α; by default what `mixers.default_for` has for the denoiser: a network shipped for
         it, else the closed form over 15×15 windows.
     method : estimator of the divergence; by default `MonteCarlo` with one probe.
+    bound : on α, without which the mix need not converge. True stands for ``Bound()``, the authors' settings;
+        False leaves α as the mixer gives it.
     key : of the random probes; None stands for ``jax.random.key(0)``.
     divergence : σ²·∂f/∂x where it is known already, as from `exact_divergence`, of
         ``denoiser.bind(frame)`` for a frame whose bad pixels are repaired (`progden_jax.repair`); then there
@@ -135,13 +138,13 @@ def progressive_denoise(
             raise ValueError(
                 f"a divergence is given and a method, {method!r}, to find it: give one of them."
             )
-    job = job_of(denoiser, mixer, method, key, outputs)
-    rule = rule_of(skip, job.outputs)
+    job = job_of(denoiser, mixer, method, key, outputs, bound)
+    rule = rule_of(skip, job)
     denoiser = job.denoiser
     canvas = _canvas(frame, canvas)
     if _is_cut(job, frame, canvas, max_memory, devices):
         _no_tracers((frame, denoiser, divergence))
-        reach = tiling.margin(denoiser, job.mixer)
+        reach = tiling.margin(denoiser, job.mixer, job.bound)
         return _windowed.within(
             job, frame, divergence, rule, max_memory, reach=reach, devices=devices
         )
@@ -180,7 +183,7 @@ Valid = tuple[Int[Array, ""], Int[Array, ""]]
 
 @functools.partial(
     jax.tree_util.register_dataclass,
-    data_fields=("denoiser", "mixer", "key"),
+    data_fields=("denoiser", "mixer", "key", "bound"),
     meta_fields=("method", "outputs"),
 )
 @dataclasses.dataclass(frozen=True)
@@ -192,6 +195,7 @@ class Job:
     key: jax.Array
     method: Method
     outputs: tuple[str, ...]
+    bound: Bound | None = None
 
     @property
     def program(self) -> Any:
@@ -222,6 +226,7 @@ def job_of(
     method: Method | None,
     key: jax.Array | None,
     outputs: Sequence[str] | None,
+    bound: Bound | bool = True,
 ) -> Job:
     """What the arguments of `progressive_denoise` stand for, checked."""
     return Job(
@@ -230,13 +235,15 @@ def job_of(
         jax.random.key(0) if key is None else key,
         DEFAULT_METHOD if method is None else method,
         _asked(outputs),
+        Bound() if bound is True else bound or None,
     )
 
 
-def rule_of(skip: Skip | bool, outputs: Sequence[str]) -> Skip | None:
-    """Which tiles may be left out, if any: only where no output is unknown there."""
+def rule_of(skip: Skip | bool, job: Job) -> Skip | None:
+    """Which tiles may be left out, if any: only where no output is unknown, and the bound keeps them."""
     rule = Skip() if skip is True else skip or None
-    return rule if _SKIPPABLE.issuperset(outputs) else None
+    kept = job.bound is not None and job.bound.radius <= skipping.MARGIN
+    return rule if kept and _SKIPPABLE.issuperset(job.outputs) else None
 
 
 @jax.jit
@@ -259,7 +266,8 @@ def _progressive(
     told = {} if place is None else {"level": place.level}
     alpha = job.mixer(x, y, variance, divergence, risk, inside=inside, **told)
     mean_variance = None if place is None else place.mean_variance
-    alpha = t_bound(alpha, x, y, variance, mean_variance=mean_variance, inside=inside)
+    if job.bound is not None:
+        alpha = job.bound(alpha, x, y, variance, mean_variance=mean_variance, inside=inside)
     images = {
         "image": x + alpha * (y - x),
         "alpha": alpha,
@@ -393,7 +401,7 @@ def _where_needed(
     if not active.any():
         windows = []
     elif has_canvas(job.denoiser) and tiling.can_tile(job.denoiser, job.mixer):
-        reach = tiling.margin(job.denoiser, job.mixer)
+        reach = tiling.margin(job.denoiser, job.mixer, job.bound)
         step = cast(Any, job.denoiser).alignment
         windows = tiling.Cover(frame.size, canvas, skip.tile, reach, step).windows(active)
     if windows is None or any(w.shape == canvas for w in windows):

@@ -86,7 +86,7 @@ class Session:
             _checks.positive_int("size", n)
         self.size = (size[0], size[1])
         self._job = cast(Job, jax.device_put(job_of(denoiser, mixer, method, key, outputs)))
-        self._rule = rule_of(skip, self._job.outputs)
+        self._rule = rule_of(skip, self._job)
         padded = getattr(denoiser, "canvas", False)
         self._canvas = (canvas_size(size[0]), canvas_size(size[1])) if padded else self.size
         self._valid: Any = tuple(np.int32(n) for n in size) if padded else None
@@ -178,7 +178,8 @@ class Session:
         if not self._cut:
             return None
         job = self._job
-        reach, step = tiling.margin(job.denoiser, job.mixer), cast(Any, job.denoiser).alignment
+        reach = tiling.margin(job.denoiser, job.mixer, job.bound)
+        step = cast(Any, job.denoiser).alignment
         lengths = [
             tuple(-(-(n // share + 2 * reach) // step) * step for share in SHARES)
             for n in self._canvas

@@ -11,15 +11,15 @@ import numpy as np
 from progden_jax.denoisers import Denoiser
 from progden_jax.frame import Frame
 from progden_jax.mixing import Mixer
-
-BOUND_RADIUS = 5
-"""The t-bound looks at 11×11."""
+from progden_jax.tstatistic import Bound
 
 SHARES = 64
 """A window's edge is so many parts of its canvas's, or fewer: the more, the less is wasted, but the fewer
 frames share a program."""
 
 _WORTH_SPLITTING = 0.9
+
+_AUTHORS_BOUND = Bound()
 
 
 class Tileable(Protocol):
@@ -87,7 +87,9 @@ def _tells_reach(denoiser: Denoiser) -> bool:
     return all(hasattr(denoiser, name) for name in ("receptive_radius", "alignment", "exposure_of"))
 
 
-def margin(denoiser: Denoiser, mixer: Mixer | None = None) -> int:
+def margin(
+    denoiser: Denoiser, mixer: Mixer | None = None, bound: Bound | None = _AUTHORS_BOUND
+) -> int:
     """How far beyond a core a window must reach: all that the result there depends on.
 
     Without a mixer, all that the denoised image depends on.
@@ -110,7 +112,8 @@ def margin(denoiser: Denoiser, mixer: Mixer | None = None) -> int:
             f"the mixer {mixer!r} cannot work on tiles: give it a receptive_radius in pixels, "
             "or leave max_memory out."
         )
-    return tileable.receptive_radius + cast(Any, mixer).receptive_radius + BOUND_RADIUS
+    bounded = 0 if bound is None else bound.radius
+    return tileable.receptive_radius + cast(Any, mixer).receptive_radius + bounded
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """The confidence bound on α that makes the mix converge to the truth."""
 
+import dataclasses
 import functools
 import math
 
@@ -13,6 +14,55 @@ from progden_jax import _checks, _windows
 from progden_jax._numeric import safe_sqrt
 
 _SIGMOIDS = {"normal": special.ndtr, "logistic": nn.sigmoid}
+
+
+@functools.partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("a", "c"),
+    meta_fields=("window", "shift", "sigmoid"),
+)
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """Settings of the t-bound, by default the authors'; see `t_bound` for each.
+
+    A pytree: one compiled program serves every `a` and `c`.
+    """
+
+    a: float = 2.0
+    c: float = 4.2
+    window: int = 11
+    shift: bool = True
+    sigmoid: str = "normal"
+
+    def __post_init__(self) -> None:
+        # Traced numbers are taken as they come.
+        if isinstance(self.a, int | float) and not 0 < self.a < math.inf:
+            raise ValueError(f"a is {self.a}, expected a steepness above 0, such as 2.")
+        if isinstance(self.c, int | float) and not math.isfinite(self.c):
+            raise ValueError(f"c is {self.c}, expected a finite number, such as 4.2.")
+        _checks.odd_int("window", self.window)
+        _checks.choice("sigmoid", self.sigmoid, _SIGMOIDS)
+
+    @property
+    def radius(self) -> int:
+        """How many pixels away the bound on α can depend on the images."""
+        return self.window // 2
+
+    def __call__(
+        self,
+        alpha: Float[Array, "h w 3"],
+        x: Float[Array, "h w 3"],
+        y: Float[Array, "h w 3"],
+        variance: Float[Array, "h w 3"],
+        *,
+        mean_variance: Float[Array, ""] | None = None,
+        inside: Bool[Array, "h w 1"] | None = None,
+    ) -> Float[Array, "h w 3"]:
+        """`t_bound` with these settings."""
+        settings = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return t_bound(
+            alpha, x, y, variance, **settings, mean_variance=mean_variance, inside=inside
+        )
 
 
 def t_bound(

@@ -217,7 +217,9 @@ def test_fig10(command, renders, tiny, tmp_path):
 def test_fig12(command, renders, tiny, tmp_path, monkeypatch):
     """Every window, with and without shift, gives another image."""
     monkeypatch.setattr(fig12, "WINDOWS", (3, 11))
-    bounds = [fig12.Bound(window, shift) for shift in (True, False) for window in (3, 11)]
+    bounds = [
+        fig12.Bound(window=window, shift=shift) for shift in (True, False) for window in (3, 11)
+    ]
     monkeypatch.setattr(fig12, "BOUNDS", bounds)
     output = tmp_path / "found.csv"
     words = ("--denoiser", tiny, "--mixer", "closed-form", "--output", output)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.special import expit, ndtr
 
 import progden_jax as pd
-from progden_jax import _windows
+from progden_jax import _windows, pipeline
 
 
 def dense_t_bound(alpha, x, y, variance, a=2.0, c=4.2, window=11, shift=True, sigmoid="normal"):
@@ -174,3 +174,35 @@ def test_messages(images):
         pd.t_bound(alpha, images.x, images.y, images.variance, sigmoid="erf")
     with pytest.raises(ValueError, match="alpha has shape"):
         pd.t_bound(alpha[:5], images.x, images.y, images.variance)
+
+
+def test_a_bound_is_checked_when_it_is_made():
+    for chosen, match in (
+        ({"a": 0.0}, "a is 0.0, expected a steepness"),
+        ({"c": float("nan")}, "c is nan, expected a finite number"),
+        ({"window": 4}, "window is 4, expected an odd"),
+        ({"sigmoid": "tanh"}, "sigmoid is 'tanh', expected one of 'normal', 'logistic'"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            pd.Bound(**chosen)
+
+
+def test_the_chain_takes_other_bounds_in_one_program(images):
+    """Every a and c by one program; without a bound α is the mixer's."""
+    frame = pd.Frame(images.x, images.variance)
+    denoiser = pd.FunctionDenoiser(lambda x: 0.6 * x + 0.1)
+    free = pd.progressive_denoise(frame, denoiser, bound=False)
+    before = pipeline._progressive._cache_size()
+    for bound in (pd.Bound(), pd.Bound(a=1.0, c=0.5), pd.Bound(c=-3.0)):
+        found = pd.progressive_denoise(frame, denoiser, bound=bound)
+        expected = bound(free.alpha, frame.color, free.denoised, frame.variance)
+        np.testing.assert_allclose(found.alpha, expected, rtol=1e-5, atol=1e-6)
+    assert pipeline._progressive._cache_size() == before + 1
+
+
+def test_nothing_is_skipped_that_a_bound_would_not_hold_back():
+    frame = pd.Frame(np.ones((32, 32, 3), np.float32), np.zeros((32, 32, 3), np.float32))
+    denoiser = pd.FunctionDenoiser(lambda x: 0.6 * x)
+    for bound, pixels in ((True, 32 * 32), (pd.Bound(window=13), 0)):
+        result = pd.progressive_denoise(frame, denoiser, bound=bound, outputs=["image"])
+        assert result.skipped.pixels == pixels

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 
 import progden_jax as pd
 from experiments import _common, _mixes
-from experiments._mixes import Bound, Mix
-from progden_jax import mixers
+from experiments._mixes import Mix
+from progden_jax import Bound, mixers
 from progden_jax.sheet import display, exposure_for
 
 HERE = Path(__file__).parent
@@ -26,7 +26,7 @@ def name(bound: Bound) -> str:
     return f"{bound.window}×{bound.window}{'' if bound.shift else ', no shift'}"
 
 
-BOUNDS = [Bound(window, shift) for shift in (True, False) for window in WINDOWS]
+BOUNDS = [Bound(window=window, shift=shift) for shift in (True, False) for window in WINDOWS]
 
 
 def plot(errors: _mixes.Errors, path: Path) -> None:
@@ -36,7 +36,10 @@ def plot(errors: _mixes.Errors, path: Path) -> None:
         free = _mixes.by_spp(errors, UNBOUNDED, label)
         for number, spp in enumerate(free):
             for shift, style in ((True, "o-"), (False, "s--")):
-                means = [_mixes.by_spp(errors, name(Bound(w, shift)), label)[spp] for w in WINDOWS]
+                means = [
+                    _mixes.by_spp(errors, name(Bound(window=w, shift=shift)), label)[spp]
+                    for w in WINDOWS
+                ]
                 axis.plot(
                     WINDOWS,
                     np.asarray(means) / free[spp],

@@ -14,12 +14,16 @@ from progden_jax.cli.denoise import HELP as DENOISE_HELP
 from progden_jax.cli.denoise import denoise
 from progden_jax.cli.devices import HELP as DEVICES_HELP
 from progden_jax.cli.devices import devices
+from progden_jax.cli.evaluate import HELP as EVALUATE_HELP
+from progden_jax.cli.evaluate import evaluate
 from progden_jax.cli.info import HELP as INFO_HELP
 from progden_jax.cli.info import info
 from progden_jax.cli.render import HELP as RENDER_HELP
 from progden_jax.cli.render import render
 from progden_jax.cli.report import HELP as REPORT_HELP
 from progden_jax.cli.report import report
+from progden_jax.cli.sweep import HELP as SWEEP_HELP
+from progden_jax.cli.sweep import sweep
 from progden_jax.cli.train import app as train
 
 app = App(
@@ -34,6 +38,8 @@ app = App(
 )
 _COMMANDS = {
     "denoise": (denoise, "IN... -o OUT [OPTIONS]", DENOISE_HELP),
+    "evaluate": (evaluate, "[DATA...] -o OUTPUT [OPTIONS]", EVALUATE_HELP),
+    "sweep": (sweep, "CONFIG -o OUTPUT [OPTIONS]", SWEEP_HELP),
     "info": (info, "IN... [OPTIONS]", INFO_HELP),
     "report": (report, "RUN -o SITE [OPTIONS]", REPORT_HELP),
     "demo": (demo, "[OPTIONS]", DEMO_HELP),

@@ -8,7 +8,7 @@ import types
 import typing
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, cast
 
 from progden_jax import _checks
 from progden_jax.training.losses import SUPERVISED
@@ -110,6 +110,7 @@ class DenoiserConfig(RunConfig):
 
 
 Config = TypeVar("Config", bound=RunConfig)
+Built = TypeVar("Built")
 
 
 def names(kind: type[RunConfig]) -> tuple[str, ...]:
@@ -133,9 +134,9 @@ def load(
     return build(kind, {**values, **(changes or {})}, source=f"configuration {os.fspath(name)}")
 
 
-def build(kind: type[Config], values: Mapping[str, Any], *, source: str) -> Config:
-    """The configuration with these fields, checked; `source` is for messages."""
-    fields = {f.name: f for f in dataclasses.fields(kind)}
+def build(kind: type[Built], values: Mapping[str, Any], *, source: str) -> Built:
+    """The dataclass with these fields, checked; `source` is for messages."""
+    fields = {f.name: f for f in dataclasses.fields(cast(Any, kind))}
     hints = typing.get_type_hints(kind)
     for name in values:
         if name not in fields:
@@ -152,7 +153,7 @@ def build(kind: type[Config], values: Mapping[str, Any], *, source: str) -> Conf
         raise ValueError(f"{source}: {error}") from None
 
 
-def parse_change(text: str, kind: type[RunConfig]) -> tuple[str, Any]:
+def parse_change(text: str, kind: type) -> tuple[str, Any]:
     """The field and value of a "field=value", the value as in TOML; quotes around text may be left out."""
     name, equals, value = text.partition("=")
     if not equals:
@@ -164,6 +165,25 @@ def parse_change(text: str, kind: type[RunConfig]) -> tuple[str, Any]:
         return name, tomllib.loads(f"value = {value}")["value"]
     except tomllib.TOMLDecodeError:
         return name, value
+
+
+def read(path: Path) -> dict[str, Any]:
+    """The fields in a configuration file, as they stand there.
+
+    Raises
+    ------
+    ValueError
+        If there is no such file, it does not end in .toml, .yaml or .yml, or holds something else.
+    """
+    if path.suffix not in _READERS:
+        raise ValueError(f"{path} is no configuration: it must end in {', '.join(_READERS)}.")
+    try:
+        values = _READERS[path.suffix](path)
+    except FileNotFoundError:
+        raise ValueError(f"{path}: there is no such file.") from None
+    if not isinstance(values, dict):
+        raise ValueError(f"{path} holds no fields, such as steps = 1000.")
+    return values
 
 
 def _values(
@@ -180,12 +200,7 @@ def _values(
                 f"config is {name!r}, expected one of {', '.join(names(kind))}, or a file that ends in "
                 f"{', '.join(_READERS)}."
             )
-    try:
-        values = _READERS[path.suffix](path)
-    except FileNotFoundError:
-        raise ValueError(f"{path}: there is no such file.") from None
-    if not isinstance(values, dict):
-        raise ValueError(f"{path} holds no fields, such as steps = 1000.")
+    values = read(path)
     base = values.pop("base", None)
     if base is None:
         return values
@@ -208,7 +223,7 @@ def _yaml(path: Path) -> Any:
         import yaml
     except ImportError:
         raise ValueError(
-            f"{path}: reading YAML needs PyYAML: pip install 'progden_jax[train]', or write TOML."
+            f"{path}: reading YAML needs PyYAML: pip install pyyaml, or write TOML."
         ) from None
     try:
         return yaml.safe_load(path.read_text())

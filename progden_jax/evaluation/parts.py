@@ -1,0 +1,112 @@
+"""The denoisers and mixers that settings name: loaded once per process, and told apart by what is in them."""
+
+import functools
+import importlib.util
+import json
+from pathlib import Path
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+
+from progden_jax import denoisers, mixers
+from progden_jax._fingerprint import fingerprint
+from progden_jax.denoisers import Denoiser, FunctionDenoiser
+from progden_jax.evaluation.settings import AUTO, DEFAULT, Settings
+from progden_jax.frame import Frame
+from progden_jax.mixing import Mixer
+
+_AUTO = ("oidn-hdr", "oidn-hdr-alb", "oidn-hdr-alb-nrm")
+"""What `denoisers.for_frame` chooses from."""
+
+
+def denoiser_for(frame: Frame, settings: Settings) -> Denoiser:
+    """The denoiser that the settings name, or that the frame's buffers call for."""
+    name = settings.denoiser
+    if name == AUTO:
+        name = denoisers.for_frame(frame).name
+    return load_denoiser(name, settings.precision)
+
+
+def mixer_for(denoiser: Denoiser, settings: Settings) -> Mixer:
+    """The mixer that the settings name, or that there is for the denoiser."""
+    if settings.mixer == DEFAULT:
+        return mixers.default_for(denoiser)
+    if settings.mixer == mixers.CLOSED_FORM:
+        return settings.closed_form
+    return _load_mixer(settings.mixer)
+
+
+@functools.lru_cache(maxsize=8)
+def load_denoiser(name: str, precision: str) -> Denoiser:
+    """A network by name or file of weights, or FILE.py:NAME, an object in a Python file.
+
+    That object is a `Denoiser`, or a JAX function of the colour.
+
+    Raises
+    ------
+    ValueError
+        If there is no such name, file or object.
+    """
+    path, colon, attribute = name.rpartition(":")
+    if not colon or not path.endswith(".py"):
+        return denoisers.load(name, precision=precision)
+    found: Any = getattr(_module(Path(path)), attribute, None)
+    if not callable(found):
+        raise ValueError(f"{name}: {path} has no function or denoiser {attribute!r}.")
+    return found if isinstance(found, Denoiser) else FunctionDenoiser(cast(Any, found))
+
+
+def content(settings: Settings) -> str:
+    """A hash of the networks' weights and structure: what their names do not tell."""
+    if settings.image == "render":
+        return ""
+    parts = [_denoiser_content(settings.denoiser, settings.precision)]
+    if settings.image == "mix" and settings.mixer != mixers.CLOSED_FORM:
+        chosen = _AUTO if settings.denoiser == AUTO else (settings.denoiser,)
+        found = [mixer_for(load_denoiser(n, settings.precision), settings) for n in chosen]
+        parts += [fingerprint(_described(mixer)) for mixer in found]
+    return fingerprint(parts)
+
+
+def trained_as(settings: Settings) -> dict[str, Any]:
+    """How the named mixing network was trained, by dotted name: the estimator and its probes."""
+    if settings.image != "mix" or settings.mixer in (DEFAULT, mixers.CLOSED_FORM):
+        return {}
+    metadata = getattr(_load_mixer(settings.mixer), "metadata", {})
+    try:
+        trained = json.loads(metadata["config"])
+    except (KeyError, ValueError):
+        return {}
+    return {f"mixer.trained.{n}": trained[n] for n in ("method", "probes", "seed") if n in trained}
+
+
+_load_mixer = functools.lru_cache(maxsize=8)(mixers.load)
+
+
+@functools.lru_cache(maxsize=32)
+def _denoiser_content(name: str, precision: str) -> str:
+    if name == AUTO:
+        return fingerprint([_denoiser_content(n, precision) for n in _AUTO])
+    denoiser = load_denoiser(name, precision)
+    if not isinstance(denoiser, denoisers.Network):
+        # A function cannot be told from another by its name; what it computes can.
+        buffers = [jax.ShapeDtypeStruct((64, 64, 3), jnp.float32)] * 4
+        return fingerprint(jax.make_jaxpr(lambda *given: denoiser(Frame(*given)))(*buffers))
+    return fingerprint(_described(denoiser))
+
+
+def _described(network: Any) -> tuple[Any, ...]:
+    return type(network).__qualname__, str(jax.tree.structure(network)), network
+
+
+def _module(path: Path) -> Any:
+    spec = importlib.util.spec_from_file_location(f"_progden_{path.stem}", path)
+    if spec is None or spec.loader is None or not path.is_file():
+        raise ValueError(f"{path}: there is no such Python file.")
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise ValueError(f"{path} cannot be imported: {type(error).__name__}: {error}") from error
+    return module
