@@ -1,7 +1,9 @@
 """The persistent compilation cache: what is compiled once is not compiled again in the next run."""
 
+import contextlib
 import functools
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +38,6 @@ def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Pa
 
 @functools.cache
 def _compilations() -> list[str]:
-    """Grows by a name with each program that is compiled, or read from the cache, from now on."""
     names: list[str] = []
 
     def listen(event: str, duration_secs: float, **details: Any) -> None:
@@ -50,3 +51,14 @@ def _compilations() -> list[str]:
 def count_compilations() -> int:
     """How many programs this process compiled, or read from the cache, since the first call."""
     return len(_compilations())
+
+
+@contextlib.contextmanager
+def counting_compilations() -> Iterator[list[str]]:
+    """The names of the programs compiled, or read from the cache, within the block; filled at its end."""
+    found: list[str] = []
+    before = count_compilations()
+    try:
+        yield found
+    finally:
+        found += _compilations()[before:]

@@ -1,8 +1,6 @@
 """What many tests share: real frames, small random images, and counts of compilations."""
 
-import contextlib
 import os
-from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,6 +12,7 @@ import numpy as np
 import pytest
 
 import progden_jax as pd
+from progden_jax.compilation import counting_compilations as counting_compilations
 
 DEMO = Path(pd.__file__).parent / "data" / "demo"
 
@@ -56,22 +55,6 @@ def drawn(form: Any, seed: int = 0) -> Any:
         return (scale * rng.normal(size=like.shape)).astype(like.dtype)
 
     return jax.tree.map(one, form)
-
-
-@contextlib.contextmanager
-def counting_compilations() -> Iterator[list[str]]:
-    """The names of the programs compiled within the block."""
-    compiled: list[str] = []
-
-    def listen(event: str, _: float, **details: object) -> None:
-        if event == "/jax/core/compile/backend_compile_duration":
-            compiled.append(str(details.get("fun_name", "")))
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
-        yield compiled
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
 
 
 def dense_jacobian_diagonal(f, x: np.ndarray) -> np.ndarray:

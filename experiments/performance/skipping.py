@@ -3,8 +3,8 @@
     python -m experiments.performance.skipping [--size 1920x1080] [--frames 100]
 
 A frame whose left half is right already, and one that has converged, against all of it; `denoise_batch`
-against a loop of single calls. Both sides are warm and take turns, answers are checked, and ratios are medians
-over rounds. Writes skipping.csv.
+against a loop of single calls. Both sides are warm and take turns, answers are checked, and ratios are
+medians over rounds. Writes skipping.csv.
 """
 
 import statistics
@@ -20,6 +20,7 @@ import progden_jax as pd
 from experiments import _common
 from experiments.performance import programs
 from experiments.performance.run import size_of
+from progden_jax.compilation import counting_compilations
 
 OUTPUT = Path(__file__).with_suffix(".csv")
 HEADER = (
@@ -83,6 +84,7 @@ def partly(whole: pd.Frame, denoiser: Any, rounds: int, size: str) -> Iterator[R
     off = np.sqrt(np.mean((dense - skipped.image) ** 2) / np.mean(np.square(dense)))
     if off > TOLERANCE:
         raise SystemExit(f"skipping gives another answer: {off:.1e} relative RMSE")
+    assert skipped.skipped is not None
     share = skipped.skipped.computed / (whole.size[0] * whole.size[1])
     notes = {"left half right": f"{share:.3f} of the pixels computed, {off:.0e} off"}
     yield from compared(calls, "all of it", rounds, f"{size}: ", notes)
@@ -94,11 +96,6 @@ def batches(
     """`denoise_batch` against a loop."""
     made = [frame(size) for size in SIZES]
     frames = [made[i % len(made)] for i in range(count)]
-    compiled: list[str] = []
-
-    def listen(event: str, _: float, **details: object) -> None:
-        if event == "/jax/core/compile/backend_compile_duration":
-            compiled.append(str(details.get("fun_name", "")))
 
     def loop() -> list[np.ndarray]:
         single = (pd.progressive_denoise(f, denoiser, outputs=["image"]) for f in frames)
@@ -107,10 +104,9 @@ def batches(
     def batch() -> list[np.ndarray]:
         return [np.asarray(result.image) for result in pd.denoise_batch(frames, denoiser)]
 
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    found = batch()
+    with counting_compilations() as compiled:
+        found = batch()
     heavy = sum("_progressive" in name for name in compiled)
-    jax.monitoring.unregister_event_duration_listener(listen)
     for one, other in zip(found, loop(), strict=True):
         if np.abs(one - other).max() > TOLERANCE * np.abs(other).max():
             raise SystemExit("a batch gives another answer than single calls")
@@ -136,12 +132,12 @@ def compared(
             clock[name].append(time.perf_counter() - begun)
             cpu[name].append(time.process_time() - used)
     for name in calls:
-        ratios = [
+        of_cpu, of_clock = (
             statistics.median(a / b for a, b in list(zip(of[name], of[against], strict=True))[1:])
             for of in (cpu, clock)
-        ]
+        )
         seconds = statistics.median(clock[name][1:])
-        yield (label + name, rounds, seconds, against, *ratios, notes.get(name, ""))
+        yield (label + name, rounds, seconds, against, of_cpu, of_clock, notes.get(name, ""))
 
 
 if __name__ == "__main__":

@@ -78,7 +78,8 @@ def main() -> None:
         spp = int(frame.spp)
         with replacing(arguments.output / "current.png") as beside:
             matplotlib.image.imsave(beside, sheet.display(image, exposure), format="png")
-        errors = [f(i, reference) for f in (metrics.rmse, metrics.flip) for i in (render, image)]
+        images = (frame.color, result.image)
+        errors = [f(i, truth.color) for f in (metrics.rmse, metrics.flip) for i in images]
         skipped = result.skipped.pixels / (size[0] * size[1]) if result.skipped else 0.0
         steps.append(Step(spp, rendered, update, skipped, *map(float, errors)))
         seen.append(Seen(spp, render, image, np.asarray(result.alpha)))

@@ -13,10 +13,10 @@ from typing import Any, Literal, NamedTuple, TypeVar
 import numpy as np
 
 from progden_jax import _files, metrics, sheet
+from progden_jax.evaluation.database import Row, rows
 from progden_jax.exr import read_exr_with_info, read_layers
 from progden_jax.report.contents import Pictures, document, newest
 from progden_jax.report.images import ImageFiles
-from progden_jax.report.rows import Row, rows
 
 Progress = Callable[[int, int], None]
 """Called with how many of how many rows have their pictures."""

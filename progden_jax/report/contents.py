@@ -10,7 +10,7 @@ import numpy as np
 from scipy import special
 
 from progden_jax import __version__
-from progden_jax.report.rows import Row
+from progden_jax.evaluation.database import Row
 
 METRICS = {
     "rmse": "RMSE",
