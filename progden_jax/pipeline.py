@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
@@ -262,9 +263,12 @@ def _progressive(
         y, divergence, *_ = job.method.evaluate(f, x, variance, job.key, **origin)
     else:
         y = f(x)
+    # Barriers: else XLA works each stage's last operations into every use of them, and compiles longer.
+    y, divergence = lax.optimization_barrier((y, divergence))
     risk = sure(x, y, variance, divergence)
     told = {} if place is None else {"level": place.level}
     alpha = job.mixer(x, y, variance, divergence, risk, inside=inside, **told)
+    alpha = lax.optimization_barrier(alpha)
     mean_variance = None if place is None else place.mean_variance
     if job.bound is not None:
         alpha = job.bound(alpha, x, y, variance, mean_variance=mean_variance, inside=inside)
