@@ -1,10 +1,9 @@
-"""Tests are compiled by XLA's older code generator for CPUs, without LLVM's optimisations, where they are to be had.
+"""Tests are compiled by XLA's older code generator for CPUs, without LLVM's optimisations, if there is one.
 
-Compiling takes most of the suite's time, a third of it with these flags: the newer generator, which users get,
-takes half as long again for most programs (not where random numbers are mapped over), and optimising
-loops over a few pixels never pays. What XLA makes of a program before that is the same. What pins the compiler
-itself or outputs asks for `as_for_users`, and commands that run as programs of their own for
-`users_environment`.
+Compiling takes most of the suite's time, with these flags a third as much: the newer generator, which users
+get, takes half as long again for most programs, and optimising loops over a few pixels never pays.
+What XLA does before that is the same. What pins the compiler itself or outputs asks for `as_for_users`,
+and commands that run as programs of their own for `users_environment`.
 """
 
 import os
