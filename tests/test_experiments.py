@@ -80,22 +80,20 @@ def two_scenes(renders: Path, folder: Path) -> Path:
     return folder
 
 
-def test_main_job(monkeypatch, capsys, renders):
-    monkeypatch.setattr(sys, "argv", ["run", "--data", str(renders), "--scenes", "1"])
-    main_job.main()
-    printed = capsys.readouterr().out
+def test_main_job(command, monkeypatch, renders, tiny):
+    monkeypatch.setattr(main_job, "DENOISERS", {"one": str(tiny), "other": str(tiny)})
+    printed = command(main_job, "--data", renders, "--scenes", 1)
     rows = [line.split("|")[1:-1] for line in printed.splitlines() if "| mix |" in line]
     assert [row[0].strip() for row in rows] == ["8", "32", "128"] * 2
     assert all(0 < float(cell) < 1 for row in rows for cell in row[2:])
 
 
-def test_main_job_without_data(monkeypatch, tmp_path):
-    monkeypatch.setattr(sys, "argv", ["run", "--data", str(tmp_path)])
+def test_main_job_without_data(command, tmp_path):
     with pytest.raises(SystemExit, match="give --data FOLDER"):
-        main_job.main()
+        command(main_job, "--data", tmp_path)
 
 
-def test_stability(monkeypatch, tmp_path):
+def test_stability(command, monkeypatch, tmp_path):
     """One small crop: derivatives keep float32's digits on every input, differences on none."""
     options = {
         "--data": DEMO,
@@ -107,11 +105,10 @@ def test_stability(monkeypatch, tmp_path):
         "--scales": 1e-6,
         "--output": tmp_path / "found.csv",
     }
-    command = [str(word) for option in options.items() for word in option]
-    chosen = ["--methods", "FiniteDifference", "MonteCarlo, gaussian"]
-    monkeypatch.setattr(sys, "argv", ["run", *command, *chosen])
-    monkeypatch.setattr(stability.pd, "enable_compilation_cache", lambda: None)
-    stability.main()
+    monkeypatch.setattr(stability, "SAMPLED", 4)
+    monkeypatch.setattr(stability, "PROBES", 2)
+    words = [word for option in options.items() for word in option]
+    command(stability, *words, "--methods", "FiniteDifference", "MonteCarlo, gaussian")
     with (tmp_path / "found.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert {row["study"] for row in rows} == {"inputs", "precision", "epsilon", "scale"}
@@ -126,24 +123,21 @@ def test_stability(monkeypatch, tmp_path):
     assert "| epsilon | 0.0001 |" in (tmp_path / "found.md").read_text()
 
 
-def test_methods(monkeypatch, tmp_path, capsys):
+def test_methods(command, monkeypatch, tiny, tmp_path):
     """On a corner of 16 pixels: probing is nearest, and a second run has nothing left to do."""
     csv_file = tmp_path / "found.csv"
-    options = ["--data", str(DEMO), "--spp", "8", "--crop", "16", "--most", "1"]
-    paths = ["--output", str(csv_file), "--kept", str(tmp_path / "exact")]
-    command = ["methods", *options, "--denoisers", "oidn-hdr-small", *paths]
-    monkeypatch.setattr(sys, "argv", command)
-    monkeypatch.setattr(methods.pd, "enable_compilation_cache", lambda: None)
-    methods.main()
-    first = capsys.readouterr().out
+    compared = [method for method in methods.methods(4) if method[1] in (0, 4)]
+    monkeypatch.setattr(methods, "methods", lambda most: compared)
+    words = ("--data", DEMO, "--spp", 8, "--crop", 16, "--denoisers", tiny)
+    words += ("--output", csv_file, "--kept", tmp_path / "exact")
+    first = command(methods, *words)
     with csv_file.open() as file:
         rows = {row["method"]: row for row in csv.DictReader(file)}
     assert float(rows["exact"]["error"]) == 0
     assert 0 < float(rows["probing"]["error"]) < float(rows["differences"]["error"])
-    assert float(rows["probing"]["passes"]) == 2
+    assert float(rows["probing"]["passes"]) == 5
     assert (tmp_path / "found.png").stat().st_size > 10_000
-    methods.main()
-    assert capsys.readouterr().out in first
+    assert command(methods, *words) in first
 
 
 def test_table3(command, renders):

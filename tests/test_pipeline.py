@@ -30,15 +30,20 @@ def same(result, expected):
 
 
 def test_it_composes_the_public_parts(real_frame, denoiser):
-    frame, key, method = crop(real_frame, 40, 56), jax.random.key(3), pd.MonteCarlo(probes=2)
-    result = pd.progressive_denoise(frame, denoiser, method=method, key=key)
+    frame, key, method = crop(real_frame, 40, 45), jax.random.key(3), pd.MonteCarlo(probes=1)
+    result = pd.progressive_denoise(frame, denoiser, key=key)
     x, variance = frame.color, frame.variance
-    f = denoiser.bind(frame)
-    y = f(x)
-    divergence = pd.divergence(f, x, variance, method=method, key=key)
-    risk = pd.sure(x, y, variance, divergence)
-    alpha = pd.ClosedForm()(x, y, variance, divergence, risk)
-    alpha = pd.t_bound(alpha, x, y, variance)
+
+    @jax.jit
+    def compose(denoiser):
+        f = denoiser.bind(frame)
+        y = f(x)
+        divergence = pd.divergence(f, x, variance, method=method, key=key)
+        risk = pd.sure(x, y, variance, divergence)
+        alpha = pd.ClosedForm()(x, y, variance, divergence, risk)
+        return y, divergence, risk, pd.t_bound(alpha, x, y, variance)
+
+    y, divergence, risk, alpha = compose(denoiser)
     expected = pd.Result(x + alpha * (y - x), alpha, y, risk, divergence, result.repairs)
     same(result, expected)
     np.testing.assert_allclose(result.sure, risk, rtol=1e-2, atol=1e-5)
@@ -49,9 +54,8 @@ def test_jit_and_vmap_agree_with_the_canvas(real_frame, denoiser):
     frame = crop(real_frame, 41, 45)
     assert canvas_size(41) != 41
     plain = pd.progressive_denoise(frame, denoiser)
-    same(jax.jit(lambda f, d: pd.progressive_denoise(f, d))(frame, denoiser), plain)
-    batch = jax.tree.map(lambda a: jnp.stack([a, a]), frame)
-    both = jax.jit(jax.vmap(lambda f: pd.progressive_denoise(f, denoiser)))(batch)
+    batch = jax.tree.map(lambda a: np.stack([a, a]), frame)
+    both = jax.jit(jax.vmap(pd.progressive_denoise, (0, None)))(batch, denoiser)
     same(jax.tree.map(lambda a: a[1], both), plain)
 
 
@@ -75,8 +79,9 @@ def test_canvas_sizes_waste_little():
     assert len({canvas_size(n) for n in range(512, 1024)}) <= 9
 
 
-def test_gradient_in_weights_and_colour(real_frame, denoiser):
+def test_gradient_in_weights_and_colour(real_frame):
     frame = crop(real_frame, 16, 16)
+    denoiser = pd.denoisers.KPCN.init(jax.random.key(0), layers=1, width=4, layer_size=3)
 
     def loss(denoiser, color):
         result = pd.progressive_denoise(frame.replace(color=color), denoiser)
@@ -111,7 +116,8 @@ def test_gradient_against_differences(real_frame, denoiser):
         np.testing.assert_allclose(gradient, difference, rtol=1e-4)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 13), (17, 1), (2, 2)])
+# On one canvas, so that one program serves them all.
+@pytest.mark.parametrize("size", [(1, 1), (1, 13), (16, 1), (2, 2)])
 def test_tiny_images(real_frame, denoiser, size):
     result = pd.progressive_denoise(crop(real_frame, *size), denoiser)
     assert result.image.shape == (*size, 3)

@@ -32,6 +32,16 @@ def small(real_frame):
     return with_truth(pd.Frame(real_frame.color[crop], real_frame.variance[crop]))
 
 
+@pytest.fixture(scope="module")
+def wild(small):
+    """The same with a firefly in one pixel."""
+    _, frame, _ = small
+    color, variance = (
+        jnp.asarray(a).at[17, 13].set(v) for a, v in ((frame.color, 1e6), (frame.variance, 1e12))
+    )
+    return with_truth(pd.Frame(color, variance))
+
+
 def with_truth(frame):
     f = pd.denoisers.load("oidn-hdr-small").bind(frame)
     truth = pd.divergence(f, frame.color, frame.variance, method=pd.Exact("cone"))
@@ -116,7 +126,7 @@ def test_nested(x, variance):
 def test_unbiased_at_every_number_of_probes(x, variance):
     truth = np.asarray(variance) * dense_jacobian_diagonal(near, np.asarray(x))
     keys = jax.random.split(jax.random.key(4), 600)
-    for count in (1, 3, 4, 11):
+    for count in (1, 3, 11):
         for scale in SCALES:
             method = pd.Probing(probes=count, scale=scale)
             found = jax.jit(
@@ -169,11 +179,11 @@ def test_outliers_get_probes_of_their_own(x, loud):
         assert len(index) == probes // 4
         assert number == expected
     assert set(np.asarray(deflated(variance, 16)[0][:3])) == set(np.flatnonzero(where))
-    found = pd.divergence(near, x, variance, method=pd.Probing(probes=16))
+    found = divergence(near, x, variance, method=pd.Probing(probes=16))
     truth = np.asarray(variance) * dense_jacobian_diagonal(near, np.asarray(x))
     np.testing.assert_allclose(found[where], truth[where], rtol=1e-5)
     quiet = jnp.where(where, 0, variance)
-    alone = pd.divergence(near, x, quiet, method=pd.Probing(probes=13))
+    alone = divergence(near, x, quiet, method=pd.Probing(probes=13))
     np.testing.assert_allclose(found[~where], alone[~where], rtol=1e-4, atol=1e-7)
 
 
@@ -195,16 +205,12 @@ def test_unbiased_beside_outliers(x, loud):
 
 
 @pytest.mark.parametrize("probes", [4, 16])
-def test_a_firefly_does_not_drown_the_other_pixels(probes, small):
+def test_a_firefly_does_not_drown_the_other_pixels(probes, small, wild):
     """σ = 1e6 in one pixel: the relative error elsewhere is at most three times that without it."""
-    _, frame, _ = small
-    color, wild = (
-        jnp.asarray(a).at[17, 13].set(v) for a, v in ((frame.color, 1e6), (frame.variance, 1e12))
-    )
     elsewhere = np.ones((32, 32), bool)
     elsewhere[17, 13] = False
     method, errors = pd.Probing(probes=probes), []
-    for f, each, truth in (small, with_truth(pd.Frame(color, wild))):
+    for f, each, truth in (small, wild):
         found = [
             pd.divergence(f, each.color, each.variance, method=method, key=key)[elsewhere]
             for key in jax.random.split(jax.random.key(9), 5)
@@ -243,7 +249,8 @@ def test_one_replicate_does_not_claim_an_error(x, variance):
 
 def test_error_of_a_tile_is_bounded_and_not_loosely(small):
     """Over keys, the variance of an image's mean is at most twice the mean of the variances / n."""
-    f, frame, _ = small
+    frame = jax.tree.map(lambda a: a[8:24, 8:24], small[1])
+    f = pd.denoisers.load("oidn-hdr-small").bind(frame)
     method = pd.Probing(probes=8, replicates=2)
     found = [
         pd.divergence_and_error(f, frame.color, frame.variance, method=method, key=key)
@@ -260,15 +267,15 @@ def test_tolerance_stops_tile_by_tile(small):
     f, frame, truth = small
     # One tile has a hundredth of the noise.
     quiet = jnp.asarray(frame.variance).at[:16, :16].multiply(1e-4)
-    loose = pd.Probing(tolerance=0.2, probes=256, tile=16)
+    loose = pd.Probing(tolerance=0.2, probes=128, tile=16)
     run = jax.jit(lambda method: evaluate(f, frame.color, quiet, method=method))
     found, strict = run(loose), run(dataclasses.replace(loose, tolerance=1e-9))
     assert found.probes.shape == (2, 2)
     spent = np.asarray(found.probes)
     assert spent[0, 0] == 2
-    assert 2 < np.sort(spent.ravel())[2] < 256
-    np.testing.assert_array_equal(strict.probes, 256)
-    plain = evaluate(f, frame.color, quiet, method=pd.Probing(probes=256, replicates=2))
+    assert 2 < np.sort(spent.ravel())[2] < 128
+    np.testing.assert_array_equal(strict.probes, 128)
+    plain = evaluate(f, frame.color, quiet, method=pd.Probing(probes=128, replicates=2))
     np.testing.assert_allclose(
         strict.divergence, plain.divergence, rtol=1e-3, atol=1e-6 * np.abs(truth).max()
     )
@@ -296,8 +303,8 @@ def test_a_stopped_tile_keeps_what_its_probes_gave(small):
 def test_tolerance_is_kept(small):
     """The mean SURE of each tile lies within a few tolerances of what the exact divergence gives."""
     f, frame, truth = small
-    tolerance = 0.02
-    method = pd.Probing(tolerance=tolerance, probes=512, tile=16)
+    tolerance = 0.08
+    method = pd.Probing(tolerance=tolerance, probes=128, tile=16)
     y = f(frame.color)
     exact = np.asarray(pd.sure(frame.color, y, frame.variance, jnp.asarray(truth, jnp.float32)))
     run = jax.jit(lambda key: evaluate(f, frame.color, frame.variance, method=method, key=key)[1:])
@@ -307,7 +314,7 @@ def test_tolerance_is_kept(small):
         found = np.asarray(pd.sure(frame.color, y, frame.variance, divergence))
         for row, column in np.ndindex(2, 2):
             # One tile's mean SURE is close to 0, so its probes run out first.
-            if spent[row, column] < 512:
+            if spent[row, column] < 128:
                 tile = (slice(16 * row, 16 * row + 16), slice(16 * column, 16 * column + 16))
                 shares.append(found[tile].mean() / exact[tile].mean() - 1)
     assert len(shares) >= 24
@@ -326,7 +333,8 @@ def test_padding_changes_nothing(real_frame):
     frame = pd.Frame(real_frame.color[:40, :50], real_frame.variance[:40, :50])
     denoiser = pd.denoisers.load("oidn-hdr-small")
     method = pd.Probing(probes=4)
-    padded = pd.progressive_denoise(frame, denoiser, method=method).divergence
+    padded = pd.progressive_denoise(frame, denoiser, method=method, outputs=["divergence"])
+    padded = padded.divergence
     plain = pd.divergence(denoiser.bind(frame), frame.color, frame.variance, method=method)
     np.testing.assert_allclose(padded, plain, rtol=1e-3, atol=1e-5 * float(jnp.abs(plain).max()))
 

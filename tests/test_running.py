@@ -7,6 +7,7 @@ import logging
 import jax
 import numpy as np
 import pytest
+from code_generation import as_for_users
 from conftest import counting_compilations, dense_jacobian_diagonal
 from test_exact import Network, network
 
@@ -115,7 +116,13 @@ def test_resumed_is_uninterrupted_bit_for_bit(method, x, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["part.npz"]
 
 
-def test_chunks_change_no_bits(x):
+def test_chunks_change_no_bits(x, monkeypatch):
+    step = jax.jit(
+        running._colors_step.__wrapped__,
+        static_argnames=("chunk", "dtype"),
+        compiler_options=as_for_users(),
+    )
+    monkeypatch.setattr(running, "_colors_step", step)
     found = [
         pd.exact_divergence(NETWORK, x, x, method=pd.Exact("coloring", chunk=chunk)).divergence
         for chunk in (5, 1, 16)
