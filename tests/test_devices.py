@@ -25,12 +25,13 @@ def job(shape=(150, 90)):
     return pd.Frame(color, variance), network, how
 
 
-def run(function, count, **environment):
+def run(function, count, flag="", **environment):
     """A function of this module in processes of their own, for devices are fixed when JAX starts."""
     environment = {
         **os.environ,
         "JAX_PLATFORMS": "cpu",
         "PYTHONPATH": os.pathsep.join(sys.path),
+        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flag}",
         **environment,
     }
     command = [sys.executable, "-c", f"import sys, test_devices as t; t.{function}(sys.argv[1])"]
@@ -55,7 +56,7 @@ def assert_same(found, expected):
 
 
 def test_simulated_devices():
-    run("on_three_devices", 1, XLA_FLAGS="--xla_force_host_platform_device_count=3")
+    run("on_three_devices", 1, flag="--xla_force_host_platform_device_count=3")
 
 
 def on_three_devices(_):
@@ -85,7 +86,7 @@ def test_processes_on_loopback():
     with socket.socket() as free:
         free.bind(("localhost", 0))
         port = free.getsockname()[1]
-    run("in_two_processes", 2, PROGDEN_TEST_PORT=str(port), XLA_FLAGS="")
+    run("in_two_processes", 2, PROGDEN_TEST_PORT=str(port))
 
 
 def in_two_processes(index):
