@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
+from progden_jax.cli._progress import timed
 from progden_jax.cli._run import FAILED, OK, UsageError, complain, print_json, tables
 
 if TYPE_CHECKING:
@@ -193,29 +194,8 @@ class _Report:
     """A bar on stderr if that is a terminal; failures as lines there, whatever it is."""
 
     def __init__(self) -> None:
-        from rich.console import Console
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            TextColumn,
-            TimeElapsedColumn,
-            TimeRemainingColumn,
-        )
-
-        console = Console(stderr=True)
         self.failures: list[str] = []
-        self._bar = Progress(
-            TextColumn("rows"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TextColumn("{task.fields[name]}", markup=False),
-            TimeRemainingColumn(),
-            console=console,
-            disable=not console.is_terminal,
-            transient=True,
-        )
+        self._bar = timed("rows")
         self._task = self._bar.add_task("", total=None, name="reading")
 
     def __enter__(self) -> "_Report":

@@ -2,6 +2,45 @@
 
 import contextlib
 from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+
+def timed(unit: str = "", *, percent: bool = False, **options: Any) -> "Progress":
+    """Bars with the time taken and left; their tasks have a field `name`, told beside.
+
+    Parameters
+    ----------
+    unit : what is counted, told before the bar.
+    percent : show a share instead of numbers.
+    options : further ones of `rich.progress.Progress`.
+    """
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    console = Console(stderr=True)
+    options = {"transient": True, "redirect_stdout": False} | options
+    return Progress(
+        *([TextColumn(unit)] if unit else []),
+        BarColumn(),
+        TaskProgressColumn() if percent else MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[name]}", markup=False),
+        TimeRemainingColumn(),
+        console=console,
+        disable=not console.is_terminal,
+        **options,
+    )
 
 
 @contextlib.contextmanager

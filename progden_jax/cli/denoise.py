@@ -18,6 +18,7 @@ from progden_jax.cli._options import (
     parse_save,
 )
 from progden_jax.cli._paths import Item, plan
+from progden_jax.cli._progress import timed
 from progden_jax.cli._run import (
     FAILED,
     OK,
@@ -195,28 +196,7 @@ class _Bars:
     """Progress on stderr if that is a terminal: of the files if they are many, and of what is long."""
 
     def __init__(self, total: int) -> None:
-        from rich.console import Console
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            TextColumn,
-            TimeElapsedColumn,
-            TimeRemainingColumn,
-        )
-
-        self.console = Console(stderr=True)
-        self.bars = Progress(
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TextColumn("{task.fields[name]}", markup=False),
-            TimeRemainingColumn(),
-            console=self.console,
-            disable=not self.console.is_terminal,
-            transient=True,
-            redirect_stdout=False,
-        )
+        self.bars = timed()
         self.many = total > 1
         self.files = self.bars.add_task("", total=total, name="", completed=-1, visible=self.many)
         self.part: TaskID | None = None

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from progden_jax.cli._paths import make_folder
+from progden_jax.cli._progress import timed
 from progden_jax.cli._run import FAILED, OK, Failure, UsageError, complain, explain, show
 
 if TYPE_CHECKING:
@@ -229,29 +230,7 @@ class _Bar:
     """Samples per pixel that are taken and the time left, on stderr if that is a terminal."""
 
     def __init__(self, total: int) -> None:
-        from rich.console import Console
-        from rich.progress import (
-            BarColumn,
-            Progress,
-            TaskProgressColumn,
-            TextColumn,
-            TimeElapsedColumn,
-            TimeRemainingColumn,
-        )
-
-        console = Console(stderr=True)
-        self.bars = Progress(
-            BarColumn(),
-            TaskProgressColumn(),
-            TimeElapsedColumn(),
-            TextColumn("{task.fields[name]}", markup=False),
-            TimeRemainingColumn(),
-            console=console,
-            disable=not console.is_terminal,
-            transient=True,
-            redirect_stdout=False,
-            speed_estimate_period=120,
-        )
+        self.bars = timed(percent=True, speed_estimate_period=120)
         self._task = self.bars.add_task("", total=total, name="")
 
     def __enter__(self) -> "_Bar":

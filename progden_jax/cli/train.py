@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Parameter
 
-from progden_jax.cli._progress import counting
+from progden_jax.cli._progress import counting, timed
 from progden_jax.cli._run import OK, UsageError, print_json, show
 
 if TYPE_CHECKING:
@@ -158,38 +158,19 @@ class _Report:
     """A bar with the time left where stderr is a terminal, and a line per evaluation on stdout."""
 
     def __init__(self, *, quiet: bool) -> None:
-        from rich.console import Console
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            TextColumn,
-            TimeRemainingColumn,
-        )
-
-        console = Console(stderr=True)
         self._quiet = quiet
-        self._bar = Progress(
-            TextColumn("step"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[text]}"),
-            console=console,
-            disable=not console.is_terminal,
-            speed_estimate_period=300,
-        )
-        self._task = self._bar.add_task("", total=None, text="")
+        self._bar = timed("step", transient=False, speed_estimate_period=300)
+        self._task = self._bar.add_task("", total=None, name="")
         self._bar.start()
 
     def started(self, step: int, steps: int) -> None:
-        self._bar.reset(self._task, total=steps, completed=step, text="compiling")
+        self._bar.reset(self._task, total=steps, completed=step, name="compiling")
 
     def stepped(self, step: int, values: dict[str, float] | None) -> None:
         self._bar.update(self._task, completed=step)
         if values:
-            text = f"loss {values['loss']:.5f}, {values['seconds_per_step']:.3g} s a step"
-            self._bar.update(self._task, text=text)
+            name = f"loss {values['loss']:.5f}, {values['seconds_per_step']:.3g} s a step"
+            self._bar.update(self._task, name=name)
 
     def evaluated(self, step: int, scores: "Scores", *, best: bool) -> None:
         if self._quiet:
