@@ -264,7 +264,8 @@ def _progressive(
     else:
         y = f(x)
     # Barriers: else XLA works each stage's last operations into every use of them, and compiles longer.
-    y, divergence = lax.optimization_barrier((y, divergence))
+    found = y, divergence
+    y, divergence = cast(tuple[Array, Array], lax.optimization_barrier(found))
     risk = sure(x, y, variance, divergence)
     told = {} if place is None else {"level": place.level}
     alpha = job.mixer(x, y, variance, divergence, risk, inside=inside, **told)
