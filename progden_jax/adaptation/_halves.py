@@ -42,8 +42,8 @@ def halves(a: Frame, b: Frame) -> Halves:
     ValueError
         If a frame is no single image, or the sizes differ.
     """
-    for name, frame in (("a.color", a.color), ("b.color", b.color)):
-        _checks.image(name, frame.color)
+    for name, color in (("a.color", a.color), ("b.color", b.color)):
+        _checks.image(name, color)
     _checks.same_shape("b.color", b.color, "a.color", a.color)
     a, b = _repaired(a), _repaired(b)
     mean, difference = {}, {}

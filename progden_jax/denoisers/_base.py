@@ -42,7 +42,9 @@ class FunctionDenoiser:
     """
 
     def __init__(self, function: Bound) -> None:
-        self.function = jax.tree_util.Partial(function)
+        partial = jax.tree_util.Partial
+        # A partial of a partial would hide the weights that the inner one has as leaves.
+        self.function = function if isinstance(function, partial) else partial(function)
 
     def __call__(self, frame: Frame) -> Float[Array, "h w 3"]:
         return self.function(frame.color)
