@@ -1,6 +1,6 @@
 """Dual buffers: two independent renders of one view, as one frame and the difference between them."""
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 from jaxtyping import Array
@@ -82,7 +82,7 @@ def split(frame: Frame, key: jax.Array) -> Halves:
             "`halves(a, b)`."
         )
     frame = _repaired(frame)
-    noise = safe_sqrt(frame.variance) * _random.normal(key, 0, frame.color)
+    noise = safe_sqrt(cast(Array, frame.variance)) * _random.normal(key, 0, frame.color)
     return Halves(frame, {"color": noise})
 
 

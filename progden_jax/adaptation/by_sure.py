@@ -127,6 +127,10 @@ def adapt(
     is unbiased for normal noise of known variance; where samples are few, variances of bright rare
     paths are too small, and fitting to it keeps some of the noise. Pixels are weighted by 1/(y² + 0.01 + σ²),
     so that neither bright nor noisy ones decide alone.
+
+    To `progressive_denoise` the weights are constants, though they follow this noise: its SURE is too low then. On
+    one scene, with the U-Net's last three layers adapted, the denoised image became better (relMSE 0.0062
+    to 0.0058 at 512 spp) and the mix worse (0.0023 to 0.0025).
     """
     adaptation = Adaptation() if adaptation is None else adaptation
     key = jax.random.key(0) if key is None else key
@@ -145,7 +149,7 @@ def _fit(
 ) -> Adapted:
     checked_variance(frame)
     frame = _repaired(frame)
-    frozen_key, choose_key, host_key = jax.random.split(key, 3)
+    step_key, look_key, host_key = jax.random.split(key, 3)
     host = generator(host_key)
     kinds = _kinds(frame.size, adaptation.block, host)
     fitted = jnp.asarray(_spread(kinds == _FIT, frame.size))[..., None]
@@ -154,7 +158,7 @@ def _fit(
 
     def look(weights: Any) -> np.ndarray:
         """Risk of each block."""
-        probed = _risks(denoiser, chosen, weights, frame, exposure, scale, choose_key, method)
+        probed = _risks(denoiser, chosen, weights, frame, exposure, scale, look_key, method)
         return _block_means(np.asarray(probed, np.float64).mean(-1), kinds.shape)
 
     method = MonteCarlo(adaptation.probes)
@@ -172,12 +176,14 @@ def _fit(
             frame,
             exposure,
             jnp.where(fitted, scale, 0),
-            jax.random.fold_in(frozen_key, step),
+            jax.random.fold_in(step_key, step),
             np.asarray(corner),
             adaptation.rate,
             crop=crop,
             method=method,
         )
+        # Steps are queued else, and progress would tell of what has not been done.
+        jax.block_until_ready(weights)
         stopped = progress(step, adaptation.steps) is False
         if step % adaptation.every and step < adaptation.steps and not stopped:
             continue
@@ -223,11 +229,11 @@ def adapt_mixer(
         If the mixer has no weights, as the closed form; see also `adapt`.
     """
     adaptation = Adaptation() if adaptation is None else adaptation
-    mix_key, key = jax.random.split(jax.random.key(0) if key is None else key)
+    mix_key, fit_key = jax.random.split(jax.random.key(0) if key is None else key)
     mixed = Mixed(passable(denoiser), mixer, mix_key)
     before = len(jax.tree.leaves(mixed.denoiser))
     chosen = tuple(before + number for number in _weights(mixer, adaptation.only))
-    found = _fit(frame, mixed, chosen, adaptation, key, progress)
+    found = _fit(frame, mixed, chosen, adaptation, fit_key, progress)
     return found._replace(adapted=found.adapted.mixer)
 
 

@@ -230,7 +230,8 @@ def post_correct(
     patch = (min(correction.patch, size[0]), min(correction.patch, size[1]))
     optimizer = OPTIMIZER.init(params)
     order = generator(order_key)
-    losses = []
+    losses: list[float] = []
+    shuffled = corners
     for step in range(total):
         if step % per_epoch == 0:
             shuffled = np.resize(order.permutation(corners), (per_epoch * batch, 2))
