@@ -128,9 +128,11 @@ def adapt(
     paths are too small, and fitting to it keeps some of the noise. Pixels are weighted by 1/(y² + 0.01 + σ²),
     so that neither bright nor noisy ones decide alone.
 
-    To `progressive_denoise` the weights are constants, though they follow this noise: its SURE is too low then. On
-    one scene, with the U-Net's last three layers adapted, the denoised image became better (relMSE 0.0062
-    to 0.0058 at 512 spp) and the mix worse (0.0023 to 0.0025).
+    To `progressive_denoise` the weights are constants, though they follow this noise, so that its SURE is
+    biased low; and a mixing network was trained behind the denoiser as it was. On one scene, with the
+    U-Net's last three layers adapted, the denoised image became better (relMSE 0.0062 to 0.0058 at 512 spp,
+    0.0073 to 0.0071 at 128) and the mix worse (0.0023 to 0.0025, 0.0033 to 0.0037). Which of the two is
+    why was not told apart.
     """
     adaptation = Adaptation() if adaptation is None else adaptation
     key = jax.random.key(0) if key is None else key
