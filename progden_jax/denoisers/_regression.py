@@ -1,20 +1,22 @@
 """Collaborative first-order regression with non-local-means weights, in blocks of pixels.
 
 Around every pixel p a linear model of the features is fitted to the image, each neighbour q counting by
-w_pq = exp(−d_pq / k²), d_pq the distance of the patches around p and q in a guide. The model predicts all of p's
-window, and what the models around a pixel predict for it is averaged with the same weights.
+w_pq = exp(−d_pq / k²), d_pq the distance of the patches around p and q in a guide. The model predicts all of
+p's window, and what the models around a pixel predict for it is averaged with the same weights.
 
 The weights of a block's pixels towards all that their windows reach form one matrix, so that moments and
-predictions are matrix products. Blocks are mapped over in groups: weights exist for one group at a time. Inside,
-images are channels-first.
+predictions are matrix products. Blocks are mapped over in groups: weights exist for one group at a time.
+Inside, images are channels-first.
 """
 
 import dataclasses
 import functools
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
@@ -63,6 +65,19 @@ class Windows:
         return 2 * self.radius + self.patch
 
 
+class Regression(NamedTuple):
+    """The filtered images, and how far each pixel depends on itself, by bandwidth.
+
+    Attributes
+    ----------
+    image : (K, H, W, C).
+    leverage : (K, H, W) the derivative of a pixel's value by its own input, all weights constant.
+    """
+
+    image: Float[Array, "k h w c"]
+    leverage: Float[Array, "k h w"]
+
+
 def regress(
     image: Float[Array, "h w c"],
     features: Float[Array, "h w f"],
@@ -74,7 +89,7 @@ def regress(
     bandwidths: tuple[float, ...],
     ridge: float,
     precision: Any = "highest",
-) -> Float[Array, "k h w c"]:
+) -> Regression:
     """The image as the models of its neighbourhoods predict it, for every bandwidth.
 
     Parameters
@@ -92,8 +107,8 @@ def regress(
 
     Notes
     -----
-    Bitterli et al. 2016, sections 4 and 5.2. Distances as of Rousselle et al. 2012, Eq. 3, averaged over patch and
-    channels, never below 0.
+    Bitterli et al. 2016, sections 4 and 5.2. Distances are those of Rousselle et al. 2012,
+    averaged over patch and channels, never below 0.
     """
     height, width = inside.shape
     group = min(_GROUP, -(-width // BLOCK))
@@ -112,18 +127,16 @@ def regress(
         begin = (0, index // columns * tall, index % columns * wide)
 
         def part(of: Array, halo: int) -> Array:
-            return lax.dynamic_slice(
-                of, begin, (of.shape[0], tall + 2 * halo, wide + 2 * halo)
-            )
+            return lax.dynamic_slice(of, begin, (of.shape[0], tall + 2 * halo, wide + 2 * halo))
 
         near = part(compared, windows.radius + windows.patch)
         channels = guide.shape[-1]
         distances = patch_distances(near[:channels], near[channels:], windows)
         values = part(taken, windows.radius)
         return _predict(
-            jnp.split(_blocks(values, windows), [image.shape[-1]], axis=1),
+            *jnp.split(_blocks(values, windows), [image.shape[-1]], axis=1),
             _blocks(part(member, windows.radius), windows),
-            _matrices(distances, windows),
+            _matrices(distances),
             bandwidths,
             ridge,
             precision,
@@ -135,7 +148,8 @@ def regress(
     r = windows.radius
     sums = sums[:, :, r : r + height, r : r + width]
     weight = jnp.where(inside, sums[:, -1:], 1)
-    return jnp.moveaxis(sums[:, :-1] / weight, 1, -1)
+    *predicted, leverage = jnp.moveaxis(sums[:, :-1] / weight, 1, 0)
+    return Regression(jnp.stack(predicted, -1), leverage)
 
 
 def patch_distances(
@@ -147,26 +161,26 @@ def patch_distances(
     """
     radius, size = windows.radius, windows.size
     rows, columns = (n - 2 * radius for n in guide.shape[1:])
-    here = (slice(None), slice(radius, radius + rows), slice(radius, radius + columns))
-    values, noise = guide[here], variance[here]
+    scale = variance + _RELATIVE_NOISE**2 * guide**2 + _LEAST
 
-    def of_row(dy: Array) -> Array:
-        there, its_noise = (
-            jnp.stack(
-                [row[..., dx : dx + columns] for dx in range(size)]
-            )
-            for row in (lax.dynamic_slice_in_dim(a, dy, rows, 1) for a in (guide, variance))
-        )
-        difference = (values - there) ** 2 - (noise + jnp.minimum(noise, its_noise))
-        level = _RELATIVE_NOISE**2 * (values**2 + there**2) + _LEAST
-        pairs = (difference / (level + noise + its_noise)).mean(1)
-        for axis in (-2, -1):
-            # A barrier each, or the compiler computes sums of sums anew for every term.
-            pairs = lax.optimization_barrier(pairs)
-            pairs = _running_mean(pairs, axis, 2 * windows.patch + 1)
-        return jnp.maximum(pairs, 0)
+    def shifted(image: Array, dy: Any, dx: Any) -> Array:
+        return lax.dynamic_slice(image, (0, dy, dx), (len(image), rows, columns))
 
-    return lax.map(of_row, jnp.arange(size))
+    value, noise, own_scale = (shifted(a, radius, radius) for a in (guide, variance, scale))
+
+    def at(offset: Array) -> Array:
+        by = offset // size, offset % size
+        other, its_noise, its_scale = (shifted(a, *by) for a in (guide, variance, scale))
+        difference = (value - other) ** 2 - (noise + jnp.minimum(noise, its_noise))
+        distance = (difference / (own_scale + its_scale)).mean(0)
+        for axis in (0, 1):
+            # Without a barrier the compiler computes sums of sums anew for every term.
+            distance = lax.optimization_barrier(distance)
+            distance = _running_mean(distance, axis, 2 * windows.patch + 1)
+        return jnp.maximum(distance, 0)
+
+    found = lax.map(at, jnp.arange(size**2))
+    return found.reshape(size, size, *found.shape[1:])
 
 
 def _running_mean(values: Array, axis: int, window: int) -> Array:
@@ -175,75 +189,82 @@ def _running_mean(values: Array, axis: int, window: int) -> Array:
     return functools.reduce(jnp.add, parts) / window
 
 
-def _matrices(distances: Float[Array, "dy dx h w"], windows: Windows) -> Float[Array, "b p q"]:
-    """Distances from each pixel p of a block to each pixel q of its region, far outside the window.
-
-    With q counted row by row, going from p to the pixel on its right moves all neighbours by 1, and to
-    the pixel below by the region's edge: rows of a matrix that are padded a little too long, and read at the
-    right length.
-    """
-    size, edge = windows.size, windows.region
-    length, blocks = edge**2, distances.shape[-1] // BLOCK
+def _matrices(distances: Float[Array, "dy dx h w"]) -> Float[Array, "b p q"]:
+    """Distances from each pixel p of a block to each pixel q of its region, far outside the window."""
+    size, blocks = len(distances), distances.shape[-1] // BLOCK
     d = distances.reshape(size, size, BLOCK, blocks, BLOCK).transpose(3, 2, 4, 0, 1)
-    d = _pad_last(d, edge).reshape(blocks, BLOCK, BLOCK, size * edge)
-    d = _pad_last(d, length + 1).reshape(blocks, BLOCK, BLOCK * (length + 1))
-    d = _pad_last(d, BLOCK * length + edge).reshape(blocks, -1)
-    return d[:, : BLOCK**2 * length].reshape(blocks, BLOCK**2, length)
+    # Barriers, for indices through several steps at once cost more than the copies.
+    d = _placed(_placed(lax.optimization_barrier(d), 2, 4), 1, 3)
+    return d.reshape(blocks, BLOCK**2, -1)
 
 
-def _pad_last(values: Array, length: int) -> Array:
-    widths = [(0, 0)] * (values.ndim - 1) + [(0, length - values.shape[-1])]
-    return jnp.pad(values, widths, constant_values=_FAR)
+def _placed(values: Array, axis: int, along: int) -> Array:
+    """What lies at n on an axis moved by n along another, which grows by what that takes."""
+    number = values.shape[axis]
+    parts = []
+    for n in range(number):
+        widths = [(0, 0)] * values.ndim
+        widths[along] = (n, number - 1 - n)
+        part = lax.slice_in_dim(values, n, n + 1, axis=axis)
+        parts.append(jnp.pad(part, widths, constant_values=_FAR))
+    return lax.optimization_barrier(jnp.concatenate(parts, axis))
 
 
 def _predict(
-    values: list[Array],
+    image: Float[Array, "b c q"],
+    features: Float[Array, "b f q"],
     member: Float[Array, "b 1 q"],
     distances: Float[Array, "b p q"],
     bandwidths: tuple[float, ...],
     ridge: float,
     precision: Any,
-) -> Float[Array, "k c+1 y x"]:
-    """Sums of weighted predictions over a group's region, and of their weights as a last channel."""
-    image, features = values
+) -> Float[Array, "k m y x"]:
+    """Sums over a group's region: of weighted predictions, of their leverages, and of the weights."""
+    blocks, channels, pixels = image.shape
     count = jnp.maximum(member.sum(-1, keepdims=True), 1)
     # Centred per block, for float32 loses small covariances beside large means.
     features = features - (member * features).sum(-1, keepdims=True) / count
     model = jnp.concatenate((member, member * features), 1)
     order = model.shape[1]
-    pairs = [(i, j) for i in range(order) for j in range(i, order)]
-    products = [model[:, i] * model[:, j] for i, j in pairs]
-    products += [model[:, i] * image[:, c] for i in range(order) for c in range(image.shape[1])]
-    moments = jnp.stack(products, 1)
-    centers = _centers(member)
+    upper = np.triu_indices(order)
+    where = np.zeros((order, order), int)
+    where[upper] = where[upper[::-1]] = np.arange(len(upper[0]))
+    products = model[:, upper[0]] * model[:, upper[1]]
+    moments = (model[:, :, None] * image[:, None]).reshape(blocks, -1, pixels)
+    moments = jnp.concatenate((products, moments), 1)
+    own = _centers(member)
+    unit = jnp.broadcast_to(
+        jnp.eye(order, dtype=image.dtype)[..., None], (order, order, own.shape[1])
+    )
+    twice = np.where(upper[0] == upper[1], 1, 2).astype(image.dtype)[:, None]
     results = []
     for bandwidth in bandwidths:
         weights = jnp.exp(distances * (-1 / bandwidth**2))
         found = jnp.einsum("bmq,bpq->bmp", moments, weights, precision=precision)
-        known = {pair: found[:, n] for n, pair in enumerate(pairs)}
-        gram = jnp.stack(
-            [
-                jnp.stack([known[min(i, j), max(i, j)] for j in range(order)], 1)
-                for i in range(order)
-            ],
-            1,
+        right = found[:, products.shape[1] :].reshape(blocks, order, channels, -1)
+        right = jnp.concatenate((right, jnp.broadcast_to(unit, (blocks, *unit.shape))), 2)
+        solved = solve_ridge(found[:, where], right, ridge) * own[:, None, None]
+        fits = solved[:, :, :channels].reshape(blocks, order * channels, -1)
+        inverse = solved[:, upper[0], channels + upper[1]] * twice
+        spread = jnp.einsum(
+            "bmp,bpq->bmq",
+            jnp.concatenate((fits, own[:, None]), 1),
+            weights,
+            precision=precision,
         )
-        right = found[:, len(pairs) :].reshape(len(found), order, image.shape[1], -1)
-        fits = solve_ridge(gram, right, ridge) * centers[:, None, None]
-        fits = fits.reshape(len(fits), -1, fits.shape[-1])
-        both = jnp.concatenate((fits, centers[:, None]), 1)
-        spread = jnp.einsum("bmp,bpq->bmq", both, weights, precision=precision)
-        at = spread[:, :-1].reshape(len(fits), order, image.shape[1], -1)
+        at = spread[:, :-1].reshape(blocks, order, channels, pixels)
         predicted = (at * model[:, :, None]).sum(1)
-        total = jnp.concatenate((predicted, member * spread[:, -1:]), 1)
-        edge = round(member.shape[-1] ** 0.5)
-        results.append(total.reshape(len(fits), -1, edge, edge))
-    return _overlapped(jnp.stack(results, 1), 0, -1, BLOCK)
+        squares = jnp.einsum("bmp,bpq->bmq", inverse, weights**2, precision=precision)
+        leverage = (squares * products).sum(1, keepdims=True)
+        results.append(jnp.concatenate((predicted, leverage, member * spread[:, -1:]), 1))
+    edge = math.isqrt(pixels)
+    parts = jnp.stack(results, 1).reshape(blocks, len(bandwidths), -1, edge, edge)
+    return _overlapped(parts, 0, -1, BLOCK)
 
 
 def _centers(member: Float[Array, "b 1 q"]) -> Float[Array, "b p"]:
     """Of the block's own pixels, in the middle of its region."""
-    edge = round(member.shape[-1] ** 0.5)
+    edge = math.isqrt(member.shape[-1])
     begin = (edge - BLOCK) // 2
     cut = slice(begin, begin + BLOCK)
     return member.reshape(-1, edge, edge)[:, cut, cut].reshape(-1, BLOCK**2)
@@ -259,16 +280,19 @@ def solve_ridge(
     and are held there.
     """
     order = gram.shape[1]
-    total = jnp.where(gram[:, 0, 0] > 0, gram[:, 0, 0], 1)
+    # A pixel weighs itself with 1; less is padding, whose squares could underflow.
+    total = jnp.where(gram[:, 0, 0] >= 1, gram[:, 0, 0], 1)
     first = (jnp.arange(order) == 0)[:, None]
     rows = jnp.arange(order)[:, None, None]
-    gram = gram + jnp.eye(order)[:, :, None].astype(gram.dtype) * jnp.where(
-        first, 0, ridge * total[:, None]
-    )[:, :, None]
+    gram = (
+        gram
+        + jnp.eye(order)[:, :, None].astype(gram.dtype)
+        * jnp.where(first, 0, ridge * total[:, None])[:, :, None]
+    )
     system = jnp.concatenate((gram, right), 2)
     for j in range(order):
-        least = total if j == 0 else ridge * total
-        pivot = jnp.maximum(system[:, j, j], least)[:, None, None]
+        pivot = total if j == 0 else jnp.maximum(system[:, j, j], ridge * total)
+        pivot = pivot[:, None, None]
         scaled = system[:, j : j + 1] / pivot
         system = jnp.where(rows == j, scaled, system - system[:, :, j : j + 1] * scaled)
     return system[:, :, order:]
