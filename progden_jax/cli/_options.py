@@ -123,8 +123,8 @@ class NetworkOptions:
     denoiser: Annotated[
         str | None,
         Parameter(
-            help="A network by name, such as oidn-hdr-alb, or a file of weights (.tza, .safetensors), or nfor, "
-            "regression without a network; by default OIDN's for the buffers in the file."
+            help="A network by name, such as oidn-hdr-alb, or a file of weights (.tza, .safetensors), or "
+            "nfor, regression without a network; by default OIDN's for the buffers in the file."
         ),
     ] = None
     quality: Annotated[

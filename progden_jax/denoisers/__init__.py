@@ -47,8 +47,8 @@ _SIZES = {"fast": ("-small", ""), "balanced": ("",), "high": ("-large", "")}
 
 
 def names() -> tuple[str, ...]:
-    """The names that `load` knows: OIDN's networks, the project's own that come with the package, and NFOR."""
-    return (*oidn.NAMES, *files.shipped(), nfor.NAME)
+    """The names that `load` knows: OIDN's networks, NFOR, and the networks that come with the package."""
+    return (*oidn.NAMES, nfor.NAME, *files.shipped())
 
 
 def load(

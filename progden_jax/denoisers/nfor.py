@@ -7,7 +7,7 @@ depth says how they differ. How strictly the weights choose is decided per pixel
 import dataclasses
 import functools
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -219,27 +219,27 @@ def _run(f: BoundNFOR, x: Array) -> Array:
         return image if f.valid is None else _repeated(image, f.valid)
 
     color, variance, features = (shown(a) for a in (x, f.variance, f.features))
-    pairs = [(color, color)]
+    images = guides = color[None]
     if f.difference is not None:
-        a, b = color + shown(f.difference), color - shown(f.difference)
-        pairs, variance = [(a, b), (b, a)], 2 * variance
+        half = shown(f.difference)
+        images, guides = (jnp.stack((color + s * half, color - s * half)) for s in (1, -1))
+        variance = 2 * variance
     settings = f.denoiser
-    found = [
-        regress(
-            image,
+    found = lax.map(
+        lambda pair: regress(
+            pair[0],
             features,
-            guide,
+            pair[1],
             variance,
             inside[..., 0],
             windows=settings.windows,
             bandwidths=settings.bandwidths,
             ridge=settings.ridge,
             precision=settings.precision,
-        )
-        for image, guide in pairs
-    ]
-    candidates, leverage = (sum(a) / len(found) for a in zip(*found, strict=True))
-    candidates, leverage = cast(Array, candidates), cast(Array, leverage)
+        ),
+        (images, guides),
+    )
+    candidates, leverage = (a.mean(0) for a in found)
     if len(settings.bandwidths) > 1:
         risks = (candidates - x) ** 2 + 2 * f.variance * leverage[..., None]
         share = lax.stop_gradient(_least_risk(jnp.where(inside, risks, 0), inside))
