@@ -12,7 +12,7 @@ import progden_jax as pd
 from progden_jax.denoisers import NFOR, _regression, nfor
 from progden_jax.denoisers._regression import Windows, regress
 
-SMALL = NFOR(radius=2, patch=1)
+SMALL = NFOR(radius=2, patch=1, inputs=("albedo", "depth"))
 SIZE = (11, 19)
 
 
@@ -44,7 +44,7 @@ def small_groups():
 def noisy():
     """Features far from zero, an image, its variance, and an independent image of the same."""
     rng = np.random.default_rng(0)
-    features = 2 + 0.5 * rng.normal(size=(*SIZE, 2))
+    features = 2 + 0.5 * rng.normal(size=(*SIZE, 3))
     image = rng.gamma(2, 1, (*SIZE, 3))
     variance = 0.3 * image**2 * rng.random(image.shape)
     guide = image + np.sqrt(variance) * rng.normal(size=image.shape)
@@ -72,9 +72,9 @@ def test_leverage_is_the_response_to_ones_own_input(noisy):
 
 def test_what_is_linear_in_the_features_is_reproduced(noisy):
     _, features, guide, _ = noisy
-    image = features @ np.array([[1, -2, 0.5], [0.25, 1, 3]], np.float32) + 7
+    image = features @ np.array([[1, -2, 0.5], [0.25, 1, 3], [1, 2, -1]], np.float32) + 7
     found = run(image, features, guide, np.full_like(guide, 1e3), 1e-6)
-    assert (np.asarray(found.leverage) < 0.3).all()
+    assert np.median(found.leverage) < 0.1
     np.testing.assert_allclose(found.image, np.stack([image] * 2), atol=1e-3)
 
 
@@ -95,7 +95,8 @@ def frame_of(height, width, seed=1):
     return pd.Frame(**{n: b.astype(np.float32) for n, b in buffers.items()}), truth
 
 
-FRAME, TRUTH = frame_of(40, 48)
+BIG, TRUTH = frame_of(56, 64)
+FRAME = jax.tree.map(lambda a: a[:40, :48], BIG)
 
 
 @jax.jit
@@ -105,8 +106,9 @@ def padded(frame, valid):
 
 def test_noise_is_removed():
     assert isinstance(SMALL, pd.Denoiser)
-    error = pd.metrics.rmse(SMALL(FRAME), TRUTH.astype(np.float32))
-    assert error < 0.4 * pd.metrics.rmse(FRAME.color, TRUTH.astype(np.float32))
+    truth = TRUTH[:40, :48].astype(np.float32)
+    # Of 25 neighbours, a few of which are the model's.
+    assert pd.metrics.rmse(SMALL(FRAME), truth) < 0.5 * pd.metrics.rmse(FRAME.color, truth)
 
 
 def test_limits():
@@ -118,7 +120,7 @@ def test_limits():
     np.testing.assert_allclose(flat, np.full_like(image, 3), rtol=1e-5)
     black = SMALL(FRAME.replace(color=0 * FRAME.color, variance=0 * FRAME.variance))
     assert not np.asarray(black).any()
-    one = padded(FRAME, (np.int32(1), np.int32(1)))
+    one = padded(BIG, (np.int32(1), np.int32(1)))
     np.testing.assert_allclose(one[0, 0], FRAME.color[0, 0], rtol=1e-5)
     assert not np.asarray(one).reshape(-1, 3)[1:].any()
     scaled = SMALL(FRAME.replace(color=1e4 * FRAME.color, variance=1e8 * FRAME.variance))
@@ -126,18 +128,16 @@ def test_limits():
 
 
 def test_canvas_and_tiles_are_as_the_whole():
-    canvas, origin = (56, 64), (8, 16)
-    full, _ = frame_of(*canvas)
-    junk = jax.tree.map(lambda a: a.at[40:].set(1e3).at[:, 48:].set(-5), full)
-    cut = jax.tree.map(lambda a: a[:40, :48], full)
+    origin = (8, 16)
+    junk = jax.tree.map(lambda a: a.at[40:].set(1e3).at[:, 48:].set(-5), BIG)
     valid = tuple(np.int32(n) for n in (40, 48))
-    np.testing.assert_allclose(padded(junk, valid)[:40, :48], SMALL(cut), atol=1e-5)
-    whole = np.asarray(padded(full, tuple(np.int32(n) for n in canvas)))
-    tile = jax.tree.map(lambda a: a[origin[0] : origin[0] + 40, origin[1] :], full)
+    np.testing.assert_allclose(padded(junk, valid)[:40, :48], SMALL(FRAME), atol=1e-5)
+    whole = np.asarray(padded(BIG, tuple(np.int32(n) for n in BIG.size)))
+    tile = jax.tree.map(lambda a: a[origin[0] : origin[0] + 40, origin[1] :], BIG)
     margin = pd.tiling.margin(SMALL)
     assert margin == 5 + 9
     np.testing.assert_allclose(
-        SMALL(tile)[margin : -margin or None, margin:],
+        SMALL(tile)[margin:-margin, margin:],
         whole[origin[0] + margin : origin[0] + 40 - margin, origin[1] + margin :],
         atol=1e-5,
     )
@@ -147,43 +147,31 @@ def test_derivatives_are_those_of_differences():
     """Through weights and fits, for one bandwidth: a choice would jump; finite without noise."""
     with jax.enable_x64(True):
         small = jax.tree.map(lambda a: jnp.asarray(a[:7, :9], jnp.float64), FRAME)
-        f = NFOR(radius=2, patch=1, bandwidths=(1.0,), inputs=("albedo",)).bind(small)
-        x, rng = small.color, np.random.default_rng(4)
-        direction = rng.normal(size=x.shape)
-        tangent = jax.jit(lambda f, x, t: jax.jvp(f, (x,), (t,))[1])
-        h = 1e-6
-        expected = (f(x + h * direction) - f(x - h * direction)) / (2 * h)
-        np.testing.assert_allclose(tangent(f, x, direction), expected, rtol=1e-5, atol=1e-7)
-        still = NFOR(radius=2, patch=1, bandwidths=(1.0,), inputs=("albedo",)).bind(
-            small.replace(variance=0 * x)
-        )
+        denoiser = NFOR(radius=2, patch=1, bandwidths=(1.0,), inputs=("albedo",))
+        both = jax.jit(lambda f, x, t: jax.jvp(f, (x,), (t,)))
+        x, h = small.color, 1e-6
+        step = jnp.asarray(np.random.default_rng(4).normal(size=x.shape))
+        f = denoiser.bind(small)
+        expected = (both(f, x + h * step, step)[0] - both(f, x - h * step, step)[0]) / (2 * h)
+        assert np.abs(expected).max() > 0.1
+        np.testing.assert_allclose(both(f, x, step)[1], expected, rtol=1e-5, atol=1e-7)
+        still = denoiser.bind(small.replace(variance=0 * x))
         for image in (x, 0 * x):
-            assert np.isfinite(tangent(still, image, direction)).all()
+            assert np.isfinite(both(still, image, step)[1]).all()
 
 
 def test_halves_filter_each_other():
     """Each with weights from the other, whose variance is twice the mean's."""
     small = jax.tree.map(lambda a: a[: SIZE[0], : SIZE[1]], FRAME).replace(normal=None, depth=None)
     difference = 0.1 * np.random.default_rng(5).normal(size=(*SIZE, 3)).astype(np.float32)
+    albedo = np.asarray(small.albedo)
     a, b = small.color + difference, small.color - difference
     found = NFOR(radius=3, patch=1, bandwidths=(1.0,)).bind(small, halves=(a, b))(small.color)
+    variance = 2 * np.asarray(small.variance)
     expected = np.mean(
-        [
-            dense_nfor.regression(
-                image,
-                small.albedo,
-                guide,
-                2 * np.asarray(small.variance),
-                radius=3,
-                patch=1,
-                bandwidth=1.0,
-                ridge=1e-3,
-            )
-            for image, guide in ((a, b), (b, a))
-        ],
-        0,
+        [run(*pair, variance, 1e-3).image[1] for pair in ((a, albedo, b), (b, albedo, a))], 0
     )
-    np.testing.assert_allclose(found, np.maximum(expected, 0), atol=2e-4)
+    np.testing.assert_allclose(found, np.maximum(expected, 0), atol=2e-5)
     with pytest.raises(ValueError, match=r"halves\[1\] has shape"):
         SMALL.bind(small, halves=(a, b[:3]))
 

@@ -71,7 +71,7 @@ class NFOR:
 
     radius: int = 9
     patch: int = 3
-    bandwidths: tuple[float, ...] = (0.5, 1.0)
+    bandwidths: tuple[float, ...] = (0.5, 1.0, 2.0)
     ridge: float = 1e-3
     inputs: tuple[str, ...] = FEATURES
     name: str = NAME
@@ -88,7 +88,7 @@ class NFOR:
             _checks.choice("inputs", role, FEATURES)
         if not self.bandwidths or not all(k > 0 for k in self.bandwidths):
             raise ValueError(
-                f"bandwidths is {self.bandwidths}, expected some numbers above 0, such as (0.5, 1.0)."
+                f"bandwidths is {self.bandwidths}, expected some numbers above 0, such as (0.5, 1.0, 2.0)."
             )
         if not self.ridge > 0:
             raise ValueError(f"ridge is {self.ridge}, expected a number above 0, such as 1e-3.")
