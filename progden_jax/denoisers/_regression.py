@@ -71,7 +71,8 @@ class Regression(NamedTuple):
     Attributes
     ----------
     image : (K, H, W, C).
-    leverage : (K, H, W) the derivative of a pixel's value by its own input, all weights constant.
+    leverage : (K, H, W) the derivative of a pixel's value by its own input, all weights constant; a constant
+        in derivatives itself.
     """
 
     image: Float[Array, "k h w c"]
@@ -237,8 +238,8 @@ def _predict(
         jnp.eye(order, dtype=image.dtype)[..., None], (order, order, own.shape[1])
     )
     twice = np.where(upper[0] == upper[1], 1, 2).astype(image.dtype)[:, None]
-    results = []
-    for bandwidth in bandwidths:
+
+    def of(bandwidth: Array) -> Array:
         weights = jnp.exp(distances * (-1 / bandwidth**2))
         found = jnp.einsum("bmq,bpq->bmp", moments, weights, precision=precision)
         right = found[:, products.shape[1] :].reshape(blocks, order, channels, -1)
@@ -254,12 +255,14 @@ def _predict(
         )
         at = spread[:, :-1].reshape(blocks, order, channels, pixels)
         predicted = (at * model[:, :, None]).sum(1)
-        squares = jnp.einsum("bmp,bpq->bmq", inverse, weights**2, precision=precision)
+        inverse, fixed = lax.stop_gradient((inverse, weights))
+        squares = jnp.einsum("bmp,bpq->bmq", inverse, fixed**2, precision=precision)
         leverage = (squares * products).sum(1, keepdims=True)
-        results.append(jnp.concatenate((predicted, leverage, member * spread[:, -1:]), 1))
+        return jnp.concatenate((predicted, leverage, member * spread[:, -1:]), 1)
+
     edge = math.isqrt(pixels)
-    parts = jnp.stack(results, 1).reshape(blocks, len(bandwidths), -1, edge, edge)
-    return _overlapped(parts, 0, -1, BLOCK)
+    parts = lax.map(of, jnp.asarray(bandwidths, image.dtype))
+    return _overlapped(parts.reshape(*parts.shape[:3], edge, edge), 1, -1, BLOCK)
 
 
 def _centers(member: Float[Array, "b 1 q"]) -> Float[Array, "b p"]:
