@@ -133,9 +133,10 @@ def regress(
         near = part(compared, windows.radius + windows.patch)
         channels = guide.shape[-1]
         distances = patch_distances(near[:channels], near[channels:], windows)
-        values = part(taken, windows.radius)
+        values = _blocks(part(taken, windows.radius), windows)
         return _predict(
-            *jnp.split(_blocks(values, windows), [image.shape[-1]], axis=1),
+            values[:, : image.shape[-1]],
+            values[:, image.shape[-1] :],
             _blocks(part(member, windows.radius), windows),
             _matrices(distances),
             bandwidths,
