@@ -265,6 +265,20 @@ def test_own_network_from_a_file(tmp_path, noisy, frames, progden, own):
     np.testing.assert_allclose(read_exr(tmp_path / "o.exr").color, expected, rtol=1e-3, atol=1e-5)
 
 
+def test_regression_instead_of_a_network(tmp_path, noisy, frames, truth, progden):
+    flags = ["--denoiser", "nfor", "--save", "denoised", "--json"]
+    status, out, _ = progden("denoise", noisy, "-o", tmp_path / "o.exr", *flags)
+    (found,) = report(out)
+    assert (status, found["denoiser"], found["mode"]) == (0, "nfor", "progressive")
+    assert found["auxiliary"] == ["albedo", "normal", "depth"]
+    denoised = stack(read_channels(tmp_path / "o.exr")[0], "denoised.R/G/B")
+    rmse = pd.metrics.rmse
+    assert rmse(denoised, truth) < 0.6 * rmse(frames[8].color, truth)
+    status, _, err = progden("denoise", noisy, "-o", tmp_path / "p.exr", *flags, *PLAIN)
+    assert status == 1
+    assert "this frame has no variance: give one" in err
+
+
 def test_prefilter_changes_what_the_network_sees(tmp_path, noisy, frames, progden):
     out = tmp_path / "o.exr"
     assert progden("denoise", noisy, "-o", out, "--prefilter", "--save", "albedo")[0] == 0

@@ -132,7 +132,8 @@ def process(item: Item, settings: Settings, outcome: Outcome, progress: Progress
     reference = None if item.reference is None else _reference(item, frame, outcome)
     frame = _with_usable_variance(frame, info, outcome)
     frame, denoiser = settings.network.load(frame)
-    outcome.denoiser, outcome.auxiliary = denoiser.name, denoiser.inputs
+    outcome.denoiser = denoiser.name
+    outcome.auxiliary = tuple(n for n in denoiser.inputs if getattr(frame, n) is not None)
     images, checkpoint = _denoise(item, frame, denoiser, settings, outcome, progress)
     if reference is not None:
         outcome.metrics = _measure(images, frame, reference)

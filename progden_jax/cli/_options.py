@@ -13,7 +13,7 @@ from cyclopts import Parameter
 from progden_jax.cli._run import UsageError
 
 if TYPE_CHECKING:
-    from progden_jax.denoisers import Network
+    from progden_jax.denoisers import NFOR, Network
     from progden_jax.divergence import Method
     from progden_jax.exr import Settings
     from progden_jax.frame import Frame
@@ -123,8 +123,8 @@ class NetworkOptions:
     denoiser: Annotated[
         str | None,
         Parameter(
-            help="A network by name, such as oidn-hdr-alb, or a file of weights (.tza, .safetensors); by "
-            "default OIDN's for the buffers in the file."
+            help="A network by name, such as oidn-hdr-alb, or a file of weights (.tza, .safetensors), or "
+            "nfor, regression without a network; by default OIDN's for the buffers in the file."
         ),
     ] = None
     quality: Annotated[
@@ -198,7 +198,7 @@ class NetworkOptions:
             raise UsageError(f"--exposure is {self.exposure!r}, expected auto or a number above 0.")
         return value
 
-    def load(self, frame: "Frame") -> "tuple[Frame, Network]":
+    def load(self, frame: "Frame") -> "tuple[Frame, Network | NFOR]":
         """The frame as the network is to see it (prefiltered if asked for), and the network."""
         from progden_jax import denoisers
 

@@ -7,10 +7,11 @@ from typing import cast
 import jax.numpy as jnp
 
 from progden_jax import _checks, _safetensors
-from progden_jax.denoisers import files, graph, oidn, unet
+from progden_jax.denoisers import files, graph, nfor, oidn, unet
 from progden_jax.denoisers._base import Bound, Denoiser, FunctionDenoiser
 from progden_jax.denoisers._network import PRECISIONS, Network
 from progden_jax.denoisers.files import save, save_tza
+from progden_jax.denoisers.nfor import NFOR
 from progden_jax.denoisers.oidn import OIDN
 from progden_jax.denoisers.own import ARCHITECTURES, INPUT_SETS, KPCN, UNet
 from progden_jax.denoisers.tza import read_tza, write_tza
@@ -20,6 +21,7 @@ __all__ = [
     "ARCHITECTURES",
     "INPUT_SETS",
     "KPCN",
+    "NFOR",
     "OIDN",
     "QUALITIES",
     "Bound",
@@ -45,8 +47,8 @@ _SIZES = {"fast": ("-small", ""), "balanced": ("",), "high": ("-large", "")}
 
 
 def names() -> tuple[str, ...]:
-    """The names that `load` knows: OIDN's networks, and the project's own that come with the package."""
-    return (*oidn.NAMES, *files.shipped())
+    """The names that `load` knows: OIDN's networks, NFOR, and the networks that come with the package."""
+    return (*oidn.NAMES, nfor.NAME, *files.shipped())
 
 
 def load(
@@ -55,14 +57,14 @@ def load(
     exposure: float | None = None,
     inputs: tuple[str, ...] | None = None,
     precision: str = "highest",
-) -> Network:
+) -> Network | NFOR:
     """The denoiser of that name, or of the weights file at that path.
 
     Parameters
     ----------
     name : one of `names()`, such as "oidn-hdr-alb-nrm", or the path of a file that ends in .tza (an `OIDN`)
         or .safetensors (a `UNet` or `KPCN`, as `save` wrote it).
-    exposure : see `OIDN`; the project's own networks take none.
+    exposure : see `OIDN`; no other takes one.
     inputs : auxiliary buffers of a .tza file's network; by default by its number of input channels:
         3 radiance, 6 with albedo, 9 with albedo and normal.
     precision : see `OIDN`.
@@ -89,7 +91,7 @@ def load(
         params = oidn.shipped_params("rt_" + base.replace("-", "_"))
         return OIDN(params, oidn.INPUTS[kind], exposure=exposure, name=text, precision=precision)
     own = files.shipped()
-    if not text.endswith(_safetensors.ENDING) and text not in own:
+    if not text.endswith(_safetensors.ENDING) and text not in own and text != nfor.NAME:
         raise ValueError(
             f"denoiser is {text!r}, expected one of {', '.join(names())}, "
             "or a path that ends in .tza or .safetensors."
@@ -98,6 +100,8 @@ def load(
         raise ValueError(
             f"exposure is {exposure}, and {text} is no OIDN network: it takes radiance as it is."
         )
+    if text == nfor.NAME:
+        return NFOR(precision=precision)
     return files.load_own(own.get(text, Path(text)), precision=precision)
 
 

@@ -181,7 +181,7 @@ class BoundNetwork:
         """f taken apart at x, for algorithms that look inside the network."""
         encoded, slope = jax.jvp(self._encode, (x,), (jnp.ones_like(x),))
         inputs = jnp.concatenate((encoded, *self.auxiliary), axis=-1)
-        inside = _inside(x.shape[:2], self.valid)
+        inside = inside_of(x.shape[:2], self.valid)
         if inside is not None:
             inputs, slope = jnp.where(inside, inputs, 0), jnp.where(inside, slope, 0)
         inputs, aligned = _padded(inputs, self.valid, self.alignment)
@@ -206,7 +206,7 @@ def _run_bound(f: BoundNetwork, x: Array) -> Array:
         precision=f.denoiser.precision,
     )
     y = f._decode(y)
-    inside = _inside(x.shape[:2], f.valid)
+    inside = inside_of(x.shape[:2], f.valid)
     return y if inside is None else jnp.where(inside, y, 0)
 
 
@@ -220,7 +220,7 @@ def run(
 ) -> Float[Array, "h w 3"]:
     """The network on transferred channels of any size, padded with zeros to its alignment, cropped again."""
     x = jnp.concatenate(channels, axis=-1)
-    inside = _inside(x.shape[:2], valid)
+    inside = inside_of(x.shape[:2], valid)
     if inside is not None:
         x = jnp.where(inside, x, 0)
     height, width = x.shape[:2]
@@ -246,7 +246,8 @@ def normal_to_unit(normal: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     return jnp.clip(normal, -1, 1) * 0.5 + 0.5
 
 
-def _inside(shape: tuple[int, ...], valid: Valid) -> Array | None:
+def inside_of(shape: tuple[int, ...], valid: Valid) -> Array | None:
+    """Where the image is, (h, w, 1), not its padding; None: everywhere."""
     if valid is None:
         return None
     rows, columns = (jnp.arange(n) < v for n, v in zip(shape, valid, strict=True))
@@ -259,7 +260,7 @@ def _padded(x: Array, valid: Valid, size: int) -> tuple[Array, Array | None]:
     if valid is None:
         return x, None
     height, width = ((n + size - 1) // size * size for n in valid)
-    return x, _inside(x.shape[:2], (height, width))
+    return x, inside_of(x.shape[:2], (height, width))
 
 
 def he_params(
