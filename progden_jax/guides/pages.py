@@ -33,6 +33,7 @@ _CONVENTIONS = (
     "evaluate",
     "bind",
     "init",
+    "setup",
     "tree_flatten",
     "tree_flatten_with_keys",
     "tree_unflatten",
