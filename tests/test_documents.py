@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from code_generation import users_environment
 from cyclopts import App, CycloptsError
 from documents import DOCUMENTS, ROOT, blocks, commands
 
@@ -136,9 +135,8 @@ def test_named_configurations_load(document, tmp_path):
 
 def test_blocks_run(tmp_path):
     """In one process of its own, for what they compile runs once: optimising it would take longer."""
-    environment = users_environment()
-    flags = f"{environment.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0"
-    environment |= {"XLA_FLAGS": flags, "PROGDEN_CACHE": str(tmp_path / "cache")}
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0"
+    environment = os.environ | {"XLA_FLAGS": flags, "PROGDEN_CACHE": str(tmp_path / "cache")}
     environment["PYTHONPATH"] = os.pathsep.join([str(ROOT / "tests"), *sys.path])
     done = subprocess.run(
         [sys.executable, "-W", "error", ROOT / "tests" / "documents.py", *DOCUMENTS],
