@@ -12,6 +12,8 @@ from typing import Any
 import jinja2
 import markupsafe
 import pdoc
+from pdoc import doc as pdoc_doc
+from pdoc import extract, render, render_helpers
 
 import progden_jax
 
@@ -53,11 +55,11 @@ def build(folder: Path) -> list[str]:
     """Write the pages to `folder`, made if missing; what is wrong with them, a line each."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        pdoc.render.configure(docformat="numpy", search=True, show_source=True)
-        pdoc.render.env.filters["to_markdown"] = _to_markdown
-        pdoc.render.env.filters["format_signature"] = _signature
+        render.configure(docformat="numpy", search=True, show_source=True)
+        render.env.filters["to_markdown"] = _to_markdown
+        render.env.filters["format_signature"] = _signature
         pdoc.pdoc(*MODULES, output_directory=folder)
-        complaints = [c for name in _modules() for c in check(pdoc.doc.Module.from_name(name))]
+        complaints = [c for name in _modules() for c in check(pdoc_doc.Module.from_name(name))]
     told = [w for w in caught if not issubclass(w.category, DeprecationWarning)]
     return sorted({*complaints, *(str(w.message) for w in told)})
 
@@ -65,12 +67,12 @@ def build(folder: Path) -> list[str]:
 @jinja2.pass_context
 def _to_markdown(context: Any, docstring: str) -> str:
     """pdoc's filter after `markdown`."""
-    return pdoc.render_helpers.to_markdown_with_context(context, markdown(docstring))
+    return render_helpers.to_markdown_with_context(context, markdown(docstring))
 
 
 def _signature(*arguments: Any, **options: Any) -> markupsafe.Markup:
     """pdoc's filter, with shapes as they are written: Float[Array, 'h w 3']."""
-    text = pdoc.render_helpers.format_signature(*arguments, **options)
+    text = render_helpers.format_signature(*arguments, **options)
     return markupsafe.Markup(_PACKAGES.sub("", text))
 
 
@@ -98,16 +100,16 @@ def _link(link: re.Match[str]) -> str:
 
 
 def _modules() -> list[str]:
-    return list(pdoc.extract.walk_specs(MODULES))
+    return list(extract.walk_specs(MODULES))
 
 
-def check(module: pdoc.doc.Module) -> Iterator[str]:
+def check(module: pdoc_doc.Module) -> Iterator[str]:
     """What is public and has no docstring, and names in docstrings that do not exist."""
     scope = {**vars(builtins), **vars(progden_jax), **vars(module.obj)}
     for doc, known in ((module, scope), *_members(module, scope)):
         if doc.name in _CONVENTIONS:
             continue
-        if not doc.docstring and not isinstance(doc, pdoc.doc.Variable):
+        if not doc.docstring and not isinstance(doc, pdoc_doc.Variable):
             yield f"{doc.fullname} has no docstring"
         for name in _NAME.findall(doc.docstring):
             if not _exists(name, known):
@@ -118,20 +120,20 @@ Scope = dict[str, Any]
 """What names stand for, None where that is not known: arguments, attributes, what the module has."""
 
 
-def _members(namespace: pdoc.doc.Namespace[Any], scope: Scope) -> Iterator[tuple[Any, Scope]]:
+def _members(namespace: pdoc_doc.Namespace[Any], scope: Scope) -> Iterator[tuple[Any, Scope]]:
     """What is documented within, each with the names that mean something there."""
     for member in namespace.own_members:
         source = member.taken_from[0]
         if member.name.startswith("_") or not source.startswith(progden_jax.__name__):
             continue
-        if isinstance(member, pdoc.doc.Module):
+        if isinstance(member, pdoc_doc.Module):
             continue
         known = {**vars(sys.modules.get(source, builtins)), **scope}
-        if isinstance(member, pdoc.doc.Function):
+        if isinstance(member, pdoc_doc.Function):
             known |= dict.fromkeys(member.signature.parameters)
-        if isinstance(member, pdoc.doc.Class):
+        if isinstance(member, pdoc_doc.Class):
             known |= {name: getattr(m, "obj", None) for name, m in member.members.items()}
-            if isinstance(made := member.members.get("__init__"), pdoc.doc.Function):
+            if isinstance(made := member.members.get("__init__"), pdoc_doc.Function):
                 known |= dict.fromkeys(made.signature.parameters)
             yield from _members(member, known)
         yield member, known
