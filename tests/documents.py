@@ -3,8 +3,10 @@
 There are in.exr and truth.exr, and renders/, a series of two numbers of samples and its reference: a corner
 of the demo. Python blocks share a namespace. A block whose first line is a comment with a file's name,
 `# mine.py`, is written there; one that begins with `# needs: pip install '.[EXTRA]'` runs where it is.
+One that begins with `# takes minutes` is not run: what it takes from modules must exist.
 """
 
+import ast
 import contextlib
 import importlib.metadata
 import io
@@ -12,9 +14,10 @@ import re
 import shlex
 import sys
 import traceback
+import types
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = (ROOT / "README.md", *sorted((ROOT / "progden_jax" / "guides").glob("*.md")))
@@ -94,6 +97,18 @@ def prepare(folder: Path) -> None:
                 pd.write_exr(folder / name, np.asarray(frame.color)[corner], layers=layers)
 
 
+def check_names(tree: ast.Module, namespace: dict[str, Any]) -> None:
+    """Import what the code imports, and look up what it takes from modules, without running it."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            exec(compile(ast.Module([node], []), "imports", "exec"), namespace)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            found = namespace.get(node.value.id)
+            if isinstance(found, types.ModuleType):
+                getattr(found, node.attr)
+
+
 def run(document: Path) -> None:
     """Everything in it that can run, in order, in the working folder; raises what a block raises."""
     from progden_jax import cli
@@ -106,7 +121,9 @@ def run(document: Path) -> None:
             # Errors show the document's own lines.
             code = compile("\n" * (block.line - 1) + block.text, document, "exec")
             needs = re.match(r"# needs: pip install '\.\[(\w+)\]'\n", block.text)
-            if needs is None or installed(needs[1]):
+            if block.text.startswith("# takes minutes\n"):
+                check_names(ast.parse(block.text), namespace)
+            elif needs is None or installed(needs[1]):
                 exec(code, namespace)
         if block.language == "sh":
             for command in filter(is_quick, commands(block.text)):

@@ -21,6 +21,7 @@ MODULES = (
     "progden_jax",  # and the modules that it exports
     "progden_jax.guides",
     "progden_jax.mixers",
+    "progden_jax.adaptation",
     "progden_jax.exr",
     "progden_jax.rendering",
     "progden_jax.training",
