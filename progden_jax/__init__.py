@@ -2,6 +2,10 @@
 
 A noisy image with its variance goes in, and a mix of it with its denoised version comes out that converges to
 the truth as samples grow (Firmino, Frisvad, Jensen 2022). Images are channels-last, linear radiance.
+
+How to use it: `progden_jax.guides`. What is not imported with the package: `progden_jax.mixers`,
+`progden_jax.adaptation`, `progden_jax.exr`, `progden_jax.rendering`, `progden_jax.training`,
+`progden_jax.evaluation` and `progden_jax.report`.
 """
 
 __version__ = "0.1.0"

@@ -223,7 +223,7 @@ def adapt_mixer(
     """The mixer with weights fitted to this render by SURE of the mix; the denoiser stays as it is.
 
     How α follows x counts in the mix's divergence, but for what reaches it through the estimated
-    divergence of the denoiser. All else as for `adapt`; `only` picks among the mixer's layers.
+    divergence of the denoiser. All else as for `adapt`; ``only`` picks among the mixer's layers.
 
     Raises
     ------

@@ -21,7 +21,7 @@ class Denoiser(Protocol):
     ``canvas = True`` takes ``bind(frame, valid=(height, width))`` for a frame padded beyond its true
     size, and then one compiled program serves images of nearby sizes. One that also has
     ``receptive_radius`` and ``alignment`` in pixels and ``exposure_of(frame, valid)``, and takes what the
-    latter gives as ``bind(..., exposure=...)``, can work on tiles: see `Tileable`.
+    latter gives as ``bind(..., exposure=...)``, can work on tiles: see `progden_jax.tiling.Tileable`.
     """
 
     def __call__(self, frame: Frame) -> Float[Array, "h w 3"]:

@@ -45,12 +45,12 @@ class Exact:
             found from f's jaxpr, along rows and columns apart, at x's size; strides, pooling,
             upsampling and all that does not depend on x are followed. Where it cannot be found, an error
             names the primitive that hinders it: give `reach`, or use "basis".
-        "cone": through windows of a few pixels in a network whose layers f shows (`f.layered`, as those of
+        "cone": through windows of a few pixels in a network whose layers f shows (``f.layered``, as those of
             `progden_jax.denoisers` do): about 400 forward passes for OIDN's base network and 200 for
             the project's KPCN, at any size.
         "auto": the quickest of those that apply, as `time` expects it; `cost` counts operations.
-    reach : (radius, alignment) in pixels for "coloring": f(x)_q depends on x_p only within `radius`, in a way
-        that repeats every `alignment` pixels. None: as f says of itself (`f.receptive_radius`), or found.
+    reach : (radius, alignment) in pixels for "coloring": f(x)_q depends on x_p only within that radius, in
+        a way that repeats at the alignment. None: as f says of itself (``f.receptive_radius``), or found.
     chunk : tangents at once ("basis", "coloring") or pixels at once ("cone"); memory grows with it.
         None: as many as make efficient products. In trials it changed no bits, but for "cone" with
         chunks under 5, where matrix products of few rows round differently (2e-7 relative).

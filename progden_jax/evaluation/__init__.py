@@ -1,6 +1,6 @@
 """Methods × renders → metrics, kept in one database per run; see `progden evaluate` and `progden sweep`.
 
-YAML and Parquet need the extra `evaluate`: pip install 'progden_jax[evaluate]'.
+YAML and Parquet need the extra ``evaluate``: pip install 'progden_jax[evaluate]'.
 """
 
 from progden_jax.evaluation.database import Row, rows

@@ -126,10 +126,10 @@ def load(
 ) -> Plan:
     """The plan of a configuration file (.yaml, .toml), or the built-in one.
 
-    The file has the fields of `Data` and these: `base`, settings that all methods share; `grid`, setting ->
-    values, of which every combination is a method (or a list of such grids); `list`, one method each: names
-    of `PRESETS`, or settings, with a `label` if wanted. Paths in it are relative to it. Settings that do not
-    matter to a method make no second one of it.
+    The file has the fields of `Data` and these: ``base``, settings that all methods share; ``grid``, setting
+    -> values, of which every combination is a method (or a list of such grids); ``list``, one method each:
+    names of `PRESETS`, or settings, with a ``label`` if wanted. Paths in it are relative to it. Settings that
+    do not matter to a method make no second one of it.
 
     Parameters
     ----------

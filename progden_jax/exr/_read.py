@@ -33,7 +33,7 @@ def read_exr(
 
     The frame covers the data window. Colour, variance, albedo, normal and depth are found by the
     names that renderers use (section 9 of the design); a frame without variance has None there.
-    Warnings go to the logger; `read_exr_with_info` returns them.
+    Warnings go to the logger; `progden_jax.exr.read_exr_with_info` returns them.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def read_exr(
         that mean. Both are unbiased and left raw: with n renders a pixel's variance is itself off
         by about sqrt(2/(n − 1)), 140 % for two.
     channels : role -> layer, channel names or another file, or None to leave the role out, for
-        color, variance, albedo, normal, depth; or the text that `parse_channel_map` takes.
+        color, variance, albedo, normal, depth; or the text that `progden_jax.exr.parse_channel_map` takes.
     part : name or index of the part that the colour is taken from, other roles too where it has
         them.
     auxiliary : False leaves albedo, normal and depth out.

@@ -58,7 +58,7 @@ def write_exr(
     path : the file to write, in a folder that exists.
     image : (H, W, 3) linear radiance, or one Frame.
     layers : name -> (H, W, 3), written as name.R/G/B, or (H, W) or (H, W, 1), as name.Y.
-    like : the input (its path, or the info that `read_exr_with_info` returned, which knows what was
+    like : the input (its path, or what `progden_jax.exr.read_exr_with_info` told of it, which knows what was
         chosen among several parts): its windows, pixel aspect, chromaticities, camera and all other
         attributes are kept, and its alpha channel (premultiplied, as EXR has it).
     spp : samples per pixel, written as the attribute samplesPerPixel; by default the frame's, else

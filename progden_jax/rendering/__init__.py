@@ -1,7 +1,8 @@
-"""Noisy renders with known variance, by Mitsuba 3 (the extra `render`): procedural scenes or one's own.
+"""Noisy renders with known variance, by Mitsuba 3 (the extra ``render``): procedural scenes or one's own.
 
 `scene` draws a scene from a seed, `load_scene` reads Mitsuba's XML, `series` yields frames as they
-grow; `progden render` writes them to files (`files.render`). Mitsuba is imported by the first call.
+grow; `progden render` writes them to files (`progden_jax.rendering.files.render`). Mitsuba is imported by
+the first call.
 """
 
 from progden_jax.rendering._mitsuba import load as use_variant

@@ -12,7 +12,7 @@ _log = logging.getLogger(__name__)
 
 
 def load(variant: str | None = None) -> Any:
-    """The module `mitsuba`, with its variant set.
+    """The module ``mitsuba``, with its variant set.
 
     Parameters
     ----------

@@ -61,7 +61,7 @@ class Job:
     made_of : what scene it is and how it is sampled, in words: files of other words are not taken for
         this job's.
     spp, reference_spp : as of `Sampling`.
-    load : the `mitsuba.Scene`; called only if a file is missing.
+    load : the ``mitsuba.Scene``; called only if a file is missing.
     options : keyword arguments of `Samples`.
     """
 

@@ -11,7 +11,7 @@ from progden_jax.rendering import _mitsuba
 
 
 def load_scene(path: str | os.PathLike[str], parameters: Mapping[str, str] | None = None) -> Any:
-    """The `mitsuba.Scene` in an XML file.
+    """The ``mitsuba.Scene`` in an XML file.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def load_scene(path: str | os.PathLike[str], parameters: Mapping[str, str] | Non
 
 
 def loaded(scene: Any) -> Any:
-    """The `mitsuba.Scene` of a dictionary, or the scene itself.
+    """The ``mitsuba.Scene`` of a dictionary, or the scene itself.
 
     Raises
     ------

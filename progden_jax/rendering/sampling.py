@@ -31,7 +31,7 @@ class Samples:
 
     Parameters
     ----------
-    scene : a loaded `mitsuba.Scene`; its integrator is used, its film, filter and sampler are not.
+    scene : a loaded ``mitsuba.Scene``; its integrator is used, its film, filter and sampler are not.
     size : height and width in pixels; by default the sensor's film has them.
     seed : any whole number from 0 up.
     sensor : which of the scene's sensors.

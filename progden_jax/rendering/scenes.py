@@ -21,7 +21,7 @@ def scene(
     size: tuple[int, int] = (128, 128),
     max_depth: int = DEPTH,
 ) -> dict[str, Any]:
-    """A scene for `mitsuba.load_dict`, the same for the same arguments.
+    """A scene for ``mitsuba.load_dict``, the same for the same arguments.
 
     Parameters
     ----------

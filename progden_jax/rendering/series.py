@@ -31,7 +31,7 @@ def series(
     Parameters
     ----------
     scene : what `rendering.scene` or `rendering.load_scene` return, or any dictionary for
-        `mitsuba.load_dict` or loaded scene. Its film, filter and sampler are not used.
+        ``mitsuba.load_dict`` or loaded scene. Its film, filter and sampler are not used.
     spp : increasing, from 2 up (one sample has no variance): [2, 8, 32].
     seed : of the samples, from 0 up.
     size : height and width in pixels; by default the sensor's film has them.

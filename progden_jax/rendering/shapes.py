@@ -15,7 +15,7 @@ from jaxtyping import Float
 from progden_jax.rendering import layout, materials
 
 Shape = Any
-"""A dictionary for `mitsuba.load_dict`, or what that made of one."""
+"""A dictionary for ``mitsuba.load_dict``, or what that made of one."""
 
 Vector = Sequence[float] | np.ndarray
 Points = Float[np.ndarray, "n 3"]

@@ -1,6 +1,6 @@
 """Training of mixing networks and denoisers, see `progden train`.
 
-Needs the extra `train`: pip install 'progden_jax[train]'.
+Needs the extra ``train``: pip install 'progden_jax[train]'.
 """
 
 from progden_jax.training.config import DenoiserConfig, MixerConfig, RunConfig

@@ -80,7 +80,7 @@ class MixerTask:
     def example(
         self, arrays: Mapping[str, Array], index: Array, key: jax.Array
     ) -> dict[str, Array]:
-        """One augmented example, with `swap` among its entries."""
+        """One augmented example, with ``swap`` among its entries."""
         draw_key, change_key, swap_key = jax.random.split(key, 3)
         picked = {name: array[index] for name, array in arrays.items() if name != "divergence"}
         which = jax.random.randint(draw_key, (), 0, self.config.draws)
