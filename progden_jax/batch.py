@@ -94,7 +94,8 @@ def denoise_batch(
 
     def run(given: Frame | Callable[[], Frame]) -> Result:
         frame = _read(given)
-        canvas = canvases.get(canvas_of(frame.size))
+        own = canvas_of(frame.size)
+        canvas = canvases.get(own, own)
 
         def call() -> Result:
             result = progressive_denoise(

@@ -32,6 +32,9 @@ DEFAULT_METHOD = MonteCarlo(probes=1)
 OUTPUTS = ("image", "alpha", "denoised", "sure", "divergence")
 """Images that a `Result` can have."""
 
+_WORTH_COMPILING = 1e6
+"""Pixels of a frame whose windows get programs of their own among many frames."""
+
 _SKIPPABLE = frozenset({"image", "alpha"})
 """Outputs that are known, x and 0, where a tile is right already."""
 
@@ -142,7 +145,7 @@ def progressive_denoise(
     job = job_of(denoiser, mixer, method, key, outputs, bound)
     rule = rule_of(skip, job)
     denoiser = job.denoiser
-    canvas = _canvas(frame, canvas)
+    shared, canvas = canvas is not None, _canvas(frame, canvas)
     if _is_cut(job, frame, canvas, max_memory, devices):
         _no_tracers((frame, denoiser, divergence))
         reach = tiling.margin(denoiser, job.mixer, job.bound)
@@ -152,7 +155,7 @@ def progressive_denoise(
     if _traced((frame, job, divergence)):
         return job.program(job, frame, divergence)
     if rule is not None:
-        return _where_needed(job, frame, divergence, rule, canvas)
+        return _where_needed(job, frame, divergence, rule, canvas, shared=shared)
     return _whole(job, frame, divergence, canvas)
 
 
@@ -394,9 +397,19 @@ def _at_once(job: Any, frame: Frame, divergence: Array | None, canvas: tuple[int
 
 
 def _where_needed(
-    job: Job, frame: Frame, divergence: Array | None, skip: Skip, canvas: tuple[int, int]
+    job: Job,
+    frame: Frame,
+    divergence: Array | None,
+    skip: Skip,
+    canvas: tuple[int, int],
+    *,
+    shared: bool,
 ) -> Result:
-    """The frame but for the tiles that are right already."""
+    """The frame but for the tiles that are right already.
+
+    Where the canvas is shared between frames, so are the windows' programs: they have few sizes, and of small
+    frames, whose windows would cost more to compile than they save, only whole ones are left out.
+    """
     variance = cast(Array, frame.variance)
     skip = skip.for_size(canvas)
     active = skipping.noisy_tiles(
@@ -405,10 +418,14 @@ def _where_needed(
     windows = None
     if not active.any():
         windows = []
+    elif shared and canvas[0] * canvas[1] < _WORTH_COMPILING:
+        windows = None
     elif has_canvas(job.denoiser) and tiling.can_tile(job.denoiser, job.mixer):
         reach = tiling.margin(job.denoiser, job.mixer, job.bound)
         step = cast(Any, job.denoiser).alignment
-        windows = tiling.Cover(frame.size, canvas, skip.tile, reach, step).windows(active)
+        lengths = tiling.few_lengths(canvas, reach, step) if shared else None
+        cover = tiling.Cover(frame.size, canvas, skip.tile, reach, step, lengths=lengths)
+        windows = cover.windows(active)
     if windows is None or any(w.shape == canvas for w in windows):
         return _whole(job, frame, divergence, canvas)
     return _windowed.assemble(job, frame, divergence, windows, skip)

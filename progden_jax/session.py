@@ -31,12 +31,6 @@ from progden_jax.skipping import Skip, Skipped
 from progden_jax.survey import BUFFERS, frame_of
 from progden_jax.tiling import Window
 
-SHARES = (2, 4)
-"""Windows around what is still noisy are as long and wide as the frame over one of these, and margins. The
-more lengths there are, the more programs."""
-
-_WORTH_CUTTING = 0.8
-
 Images = dict[str, Array]
 
 
@@ -180,17 +174,9 @@ class Session:
         job = self._job
         reach = tiling.margin(job.denoiser, job.mixer, job.bound)
         step = cast(Any, job.denoiser).alignment
-        lengths = [
-            tuple(-(-(n // share + 2 * reach) // step) * step for share in SHARES)
-            for n in self._canvas
-        ]
-        lengths = [
-            tuple(length for length in some if length <= _WORTH_CUTTING * n)
-            for some, n in zip(lengths, self._canvas, strict=True)
-        ]
-        cover = tiling.Cover(
-            self.size, self._canvas, tile, reach, step, lengths=(lengths[0], lengths[1])
-        )
+        # Few, for each is a program.
+        lengths = tiling.few_lengths(self._canvas, reach, step)
+        cover = tiling.Cover(self.size, self._canvas, tile, reach, step, lengths=lengths)
         windows = cover.windows(active)
         return None if any(w.shape == self._canvas for w in windows) else windows
 

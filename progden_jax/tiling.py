@@ -230,6 +230,22 @@ def shape_of_parts(size: tuple[int, int], count: int, reach: int, step: int) -> 
     return min(shapes, key=lambda shape: shape[0] * shape[1])
 
 
+_COARSE = (2, 4)
+_WORTH_CUTTING = 0.8
+
+
+def few_lengths(
+    canvas: tuple[int, int], reach: int, step: int
+) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """For `Cover` where programs are to be shared: a half and a quarter of the canvas, and margins."""
+
+    def lengths(n: int) -> tuple[int, ...]:
+        some = (_up(math.ceil(n / share) + 2 * reach, step) for share in _COARSE)
+        return tuple(length for length in some if length <= _WORTH_CUTTING * n)
+
+    return lengths(canvas[0]), lengths(canvas[1])
+
+
 def smallest_window(reach: int, step: int) -> int:
     """The least edge that leaves a window a core."""
     return _up(2 * reach + 2 * step, step)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import progden_jax as pd
-from progden_jax import batch
+from progden_jax import batch, pipeline, tiling
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +37,26 @@ def test_batched_is_single_in_order_and_few_programs(frames, denoiser):
         alone = pd.progressive_denoise(frame, denoiser)
         np.testing.assert_allclose(result.image, alone.image, rtol=1e-4, atol=1e-6)
         assert result.denoised is None
+
+
+def test_windows_around_noise_do_not_multiply_programs(frames, denoiser, monkeypatch):
+    variance = np.array(frames[3].variance)
+    variance[:, :32] = 0
+    half = frames[3].replace(variance=variance)
+    covers = []
+
+    def cover(*arguments, **rest):
+        covers.append(real(*arguments, **rest))
+        return covers[-1]
+
+    real = tiling.Cover
+    monkeypatch.setattr(tiling, "Cover", cover)
+    (small,) = pd.denoise_batch([half], denoiser, outputs=("image", "alpha"))
+    assert covers == []
+    assert small.skipped.pixels == 0
+    monkeypatch.setattr(pipeline, "_WORTH_COMPILING", 0)
+    list(pd.denoise_batch(iter([half]), denoiser, outputs=("image", "alpha")))
+    assert [len(lengths) <= 2 for cover in covers for lengths in cover.lengths] == [True, True]
 
 
 def test_frames_are_read_on_threads_and_only_when_needed(frames, denoiser):
