@@ -35,8 +35,9 @@ Size = tuple[int, int]
 PROGRAMS = 3
 """So many shapes are compiled for a batch at most."""
 
-_PIXELS_PER_PROGRAM = 4e6
-"""Padding that costs as much time as compiling another program, about."""
+_PIXELS_PER_PROGRAM = 5e5
+"""Padding that costs as much time as another program from the compilation cache, about. Compiling it costs
+some times as much, but once."""
 
 AT_ONCE = 2
 """Frames in work: while one is read, prepared or handed on, another computes."""

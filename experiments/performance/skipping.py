@@ -41,7 +41,9 @@ Row = tuple[str, int, float, str, float, float, str]
 def main() -> None:
     parser = _common.parser(__doc__)
     parser.set_defaults(data=_common.TRAIN, scenes=4)
-    parser.add_argument("--size", default="1920x1080", help="WIDTHxHEIGHT of the single frame")
+    parser.add_argument(
+        "--size", default="1920x1080", help="WIDTHxHEIGHT of the single frame, or none"
+    )
     parser.add_argument("--frames", type=int, default=100, help="of the batch")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--denoiser", default="oidn-hdr")
@@ -55,11 +57,15 @@ def main() -> None:
         found, _ = programs.load_frame(arguments.data, names, arguments.spp, size)
         return pd.Frame(found.color, found.variance)
 
-    rows = [
-        *partly(frame(size_of(arguments.size)), denoiser, arguments.rounds, arguments.size),
-        *batches(frame, denoiser, arguments.frames, arguments.rounds),
-    ]
-    _common.write_csv(arguments.output, HEADER, rows)
+    rows: list[Row] = []
+    if arguments.size != "none":
+        whole = frame(size_of(arguments.size))
+        rows += partly(whole, denoiser, arguments.rounds, arguments.size)
+    rows += batches(frame, denoiser, arguments.frames, arguments.rounds)
+    names = {row[0] for row in rows}
+    before = _common.read_csv(arguments.output)
+    kept = [tuple(row.values()) for row in before if row["what"] not in names]
+    _common.write_csv(arguments.output, HEADER, [*kept, *rows])
     print(_common.markdown(HEADER, rows))
 
 
