@@ -62,9 +62,9 @@ def main() -> None:
         whole = frame(size_of(arguments.size))
         rows += partly(whole, denoiser, arguments.rounds, arguments.size)
     rows += batches(frame, denoiser, arguments.frames, arguments.rounds)
-    names = {row[0] for row in rows}
+    measured = {row[0] for row in rows}
     before = _common.read_csv(arguments.output)
-    kept = [tuple(row.values()) for row in before if row["what"] not in names]
+    kept = [tuple(row.values()) for row in before if row["what"] not in measured]
     _common.write_csv(arguments.output, HEADER, [*kept, *rows])
     print(_common.markdown(HEADER, rows))
 
