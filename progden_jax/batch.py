@@ -9,23 +9,14 @@ from typing import Any
 import jax
 
 from progden_jax import _checks
+from progden_jax._canvas import call_of, canvas_size, cropped, has_canvas
 from progden_jax._devices import Device, on_each
+from progden_jax._program import Job, checked_variance
 from progden_jax.denoisers import Denoiser
 from progden_jax.divergence import Method
 from progden_jax.frame import Frame
 from progden_jax.mixing import Mixer
-from progden_jax.pipeline import (
-    Job,
-    Result,
-    call_of,
-    canvas_size,
-    checked_variance,
-    cropped,
-    has_canvas,
-    job_of,
-    progressive_denoise,
-    rule_of,
-)
+from progden_jax.pipeline import Result, job_of, progressive_denoise, rule_of
 from progden_jax.skipping import Skip, Skipped, noisy_tiles
 from progden_jax.survey import BUFFERS
 from progden_jax.tstatistic import Bound
@@ -79,7 +70,7 @@ def denoise_batch(
     Raises
     ------
     ValueError
-        As `progressive_denoise`, when the frame's turn comes; if sizes are not as many as frames.
+        As `progressive_denoise`, when the frame's turn comes.
     """
     _checks.positive_int("at_once", at_once)
     if sizes is None and isinstance(frames, Sequence) and all(isinstance(f, Frame) for f in frames):
@@ -151,7 +142,14 @@ def _on_devices(
             canvas = canvases.get(canvas_of(frame.size), canvas_of(frame.size))
         if rule is not None and not noisy_tiles(frame.color, variance, rule).any():
             done[index] = progressive_denoise(
-                frame, job.denoiser, bound=job.bound or False, outputs=job.outputs, skip=rule
+                frame,
+                job.denoiser,
+                mixer=job.mixer,
+                method=job.method,
+                bound=job.bound or False,
+                key=job.key,
+                outputs=job.outputs,
+                skip=rule,
             )
         else:
             kind = (canvas, *(getattr(frame, name) is None for name in BUFFERS))

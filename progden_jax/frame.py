@@ -173,6 +173,12 @@ def repair(frame: Frame, *, inside: Bool[Array, "h w 1"] | None = None) -> tuple
     return frame.replace(color=color, variance=variance, **auxiliary), repairs
 
 
+@jax.jit
+def repaired(frame: Frame) -> Frame:
+    """The frame alone of `repair`, compiled."""
+    return repair(frame)[0]
+
+
 def _count(bad: Array) -> Int[Array, ""]:
     return bad.any(-1).sum(dtype=jnp.int32)
 

@@ -1,79 +1,36 @@
-"""The whole chain for one frame: repair, denoise, divergence, SURE, mix, bound; whole or window by window."""
+"""One frame from render to result: whole, window by window, or only where there is noise."""
 
-import dataclasses
-import functools
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, cast
+from collections.abc import Sequence
+from typing import Any, cast
 
 import jax
-import jax.numpy as jnp
-import numpy as np
-from jax import lax
 from jax.core import Tracer
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from progden_jax import _checks, _windowed, skipping, tiling
+from progden_jax._canvas import call_of, canvas_size, cropped, has_canvas
 from progden_jax._devices import Device
-from progden_jax._windowed import Place
+from progden_jax._program import OUTPUTS, Denoised, Job, PlainJob, Result, checked_variance
 from progden_jax.denoisers import Denoiser
 from progden_jax.denoisers._base import passable
 from progden_jax.divergence import Method, MonteCarlo
-from progden_jax.frame import Frame, Repairs, repair
+from progden_jax.frame import Frame
 from progden_jax.mixers import default_for
 from progden_jax.mixing import Mixer
 from progden_jax.skipping import Skip, Skipped
-from progden_jax.sure import sure
-from progden_jax.survey import BUFFERS, crop, frame_of
+from progden_jax.survey import crop
 from progden_jax.tstatistic import Bound
+
+__all__ = ["DEFAULT_METHOD", "OUTPUTS", "Denoised", "Result", "denoise", "progressive_denoise"]
 
 DEFAULT_METHOD = MonteCarlo(probes=1)
 """One probe: averaging windows remove its noise, see experiments/main_job."""
-
-OUTPUTS = ("image", "alpha", "denoised", "sure", "divergence")
-"""Images that a `Result` can have."""
 
 _WORTH_COMPILING = 1e6
 """Pixels of a frame whose windows get programs of their own among many frames."""
 
 _SKIPPABLE = frozenset({"image", "alpha"})
 """Outputs that are known, x and 0, where a tile is right already."""
-
-
-class Result(NamedTuple):
-    """A progressively denoised frame and what led to it; images are (H, W, 3), linear radiance.
-
-    Attributes
-    ----------
-    image : the mix z = x + α(y − x).
-    alpha : weight of the denoised image per pixel and channel after the t-bound, in [0, 1].
-    denoised : y, the denoiser's output.
-    sure : risk estimate of y per pixel, squared radiance, may be negative.
-    divergence : the estimate of σ²·∂f/∂x that it rests on.
-    repairs : counts of bad pixels, see `progden_jax.repair`.
-    mean_alpha : over pixels and channels.
-    mean_sure : the estimate of the denoised image's mean squared error, over the pixels that were denoised; 0
-        if none was.
-    skipped : what was left out and why; None inside ``jit``, where nothing can be.
-
-    Images that were not asked for are None.
-    """
-
-    image: Float[Array, "h w 3"]
-    alpha: Float[Array, "h w 3"]
-    denoised: Float[Array, "h w 3"]
-    sure: Float[Array, "h w 3"]
-    divergence: Float[Array, "h w 3"]
-    repairs: Repairs
-    mean_alpha: Float[Array, ""] | None = None
-    mean_sure: Float[Array, ""] | None = None
-    skipped: Skipped | None = None
-
-
-class Denoised(NamedTuple):
-    """A plainly denoised frame: the image (H, W, 3), and counts of bad pixels."""
-
-    image: Float[Array, "h w 3"]
-    repairs: Repairs
 
 
 def progressive_denoise(
@@ -172,7 +129,7 @@ def denoise(
     """
     _checks.image("frame.color", frame.color)
     denoiser = passable(denoiser)
-    job = _PlainJob(denoiser)
+    job = PlainJob(denoiser)
     if _is_cut(job, frame, _canvas(frame), max_memory, devices):
         _no_tracers((frame, denoiser))
         reach = tiling.margin(denoiser)
@@ -180,48 +137,6 @@ def denoise(
     if _traced((frame, denoiser)):
         return job.program(job, frame, None)
     return _at_once(job, frame, None, _canvas(frame))
-
-
-Valid = tuple[Int[Array, ""], Int[Array, ""]]
-
-
-@functools.partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("denoiser", "mixer", "key", "bound"),
-    meta_fields=("method", "outputs"),
-)
-@dataclasses.dataclass(frozen=True)
-class Job:
-    """What holds for every window of a frame, and for every frame of a batch: a pytree."""
-
-    denoiser: Denoiser
-    mixer: Mixer
-    key: jax.Array
-    method: Method
-    outputs: tuple[str, ...]
-    bound: Bound | None = None
-
-    @property
-    def program(self) -> Any:
-        """The compiled function of (job, frame, divergence, valid, place) to a `Result`."""
-        return _progressive
-
-    @staticmethod
-    def result(images: Mapping[str, Any], **rest: Any) -> Result:
-        """From the images that were asked for, and the other fields."""
-        return Result(**{name: images.get(name) for name in OUTPUTS}, **rest)
-
-
-def checked_variance(frame: Frame) -> Array:
-    """That of the frame, which must be a single image that has one."""
-    _checks.image("frame.color", frame.color)
-    if frame.variance is None:
-        raise ValueError(
-            "the frame has no variance, and progressive denoising needs that of the sample mean: give one, "
-            "make one from half-buffers or several seeds (read_exr's variance_from), or denoise "
-            "plainly with `denoise(frame, denoiser)`."
-        )
-    return frame.variance
 
 
 def job_of(
@@ -248,148 +163,6 @@ def rule_of(skip: Skip | bool, job: Job) -> Skip | None:
     rule = Skip() if skip is True else skip or None
     kept = job.bound is not None and job.bound.radius <= skipping.MARGIN
     return rule if kept and _SKIPPABLE.issuperset(job.outputs) else None
-
-
-@jax.jit
-def _progressive(
-    job: Job,
-    frame: Frame,
-    divergence: Array | None,
-    valid: Valid | None = None,
-    place: Place | None = None,
-) -> Result:
-    frame, inside, repairs = prepare(frame, valid, place)
-    x, variance = frame.color, cast(Array, frame.variance)
-    f = _bind(job.denoiser, frame, valid, place)
-    if divergence is None:
-        origin = {} if place is None else {"origin": place.origin}
-        y, divergence, *_ = job.method.evaluate(f, x, variance, job.key, **origin)
-    else:
-        y = f(x)
-    # Barriers: else XLA works each stage's last operations into every use of them, and compiles longer.
-    found = y, divergence
-    y, divergence = cast(tuple[Array, Array], lax.optimization_barrier(found))
-    risk = sure(x, y, variance, divergence)
-    told = {} if place is None else {"level": place.level}
-    alpha = job.mixer(x, y, variance, divergence, risk, inside=inside, **told)
-    alpha = lax.optimization_barrier(alpha)
-    mean_variance = None if place is None else place.mean_variance
-    if job.bound is not None:
-        alpha = job.bound(alpha, x, y, variance, mean_variance=mean_variance, inside=inside)
-    images = {
-        "image": x + alpha * (y - x),
-        "alpha": alpha,
-        "denoised": y,
-        "sure": risk,
-        "divergence": divergence,
-    }
-    counted = inside if place is None else core_mask(frame.size, place)
-    return job.result(
-        {name: images[name] for name in job.outputs},
-        repairs=repairs,
-        mean_alpha=_mean(alpha, counted),
-        mean_sure=_mean(risk, counted),
-    )
-
-
-@functools.partial(jax.tree_util.register_dataclass, data_fields=("denoiser",), meta_fields=())
-@dataclasses.dataclass(frozen=True)
-class _PlainJob:
-    denoiser: Denoiser
-    outputs = ("image",)
-    method = None
-
-    @property
-    def program(self) -> Any:
-        return _plain
-
-    @staticmethod
-    def result(images: Mapping[str, Any], *, repairs: Repairs, **_: Any) -> Denoised:
-        return Denoised(images["image"], repairs)
-
-
-@jax.jit
-def _plain(
-    job: _PlainJob,
-    frame: Frame,
-    divergence: None,
-    valid: Valid | None = None,
-    place: Place | None = None,
-) -> Denoised:
-    del divergence
-    frame, _, repairs = prepare(frame, valid, place)
-    image = _bind(job.denoiser, frame, valid, place)(frame.color)
-    return Denoised(image, cast(Repairs, repairs))
-
-
-def prepare(
-    frame: Frame, valid: Valid | None, place: Place | None
-) -> tuple[Frame, Array | None, Repairs | None]:
-    """The frame repaired, where it is no padding, and the repairs; a window's frame is repaired already."""
-    inside = None
-    if valid is not None:
-        rows, columns = (jnp.arange(n) < v for n, v in zip(frame.size, valid, strict=True))
-        inside = (rows[:, None] & columns[None, :])[..., None]
-    if place is not None:
-        return frame, inside, None
-    repaired, repairs = repair(frame, inside=inside)
-    return repaired, inside, repairs
-
-
-def _bind(
-    denoiser: Denoiser, frame: Frame, valid: Valid | None, place: Place | None
-) -> Callable[[Array], Array]:
-    known = {} if valid is None else {"valid": valid}
-    if place is not None:
-        known["exposure"] = place.exposure
-    return denoiser.bind(frame, **known)
-
-
-def core_mask(size: tuple[int, int], place: Place) -> Array:
-    """(h, w, 1), true in what counts of a window of that size."""
-    top, bottom, left, right = place.core
-    rows, columns = (jnp.arange(n) for n in size)
-    return (((rows >= top) & (rows < bottom))[:, None] & ((columns >= left) & (columns < right)))[
-        ..., None
-    ]
-
-
-def _mean(image: Array, counted: Array | None) -> Array:
-    """Over the pixels that count; a huge frame's sum would have no digits left."""
-    if counted is None:
-        return image.mean()
-    return jnp.where(counted, image, 0).sum() / (image.shape[-1] * jnp.maximum(counted.sum(), 1))
-
-
-def canvas_size(n: int) -> int:
-    """`n` pixels rounded up so that there are eight sizes per doubling, multiples of 16."""
-    step = max(16, 1 << max(n.bit_length() - 4, 0))
-    return -(-n // step) * step
-
-
-def call_of(
-    job: Any, frame: Frame, canvas: tuple[int, int], divergence: Array | None = None
-) -> tuple[Any, ...]:
-    """The arguments of the job's program for a whole frame, padded to its canvas where that may be."""
-    if not has_canvas(job.denoiser):
-        return frame, divergence
-    buffers = {n: getattr(frame, n) for n in BUFFERS if getattr(frame, n) is not None}
-    if canvas != frame.size:
-        buffers = {name: crop(buffer, (0, 0), canvas) for name, buffer in buffers.items()}
-        divergence = None if divergence is None else crop(divergence, (0, 0), canvas)
-    return frame_of(buffers), divergence, tuple(np.int32(n) for n in frame.size)
-
-
-def cropped(result: Any, size: tuple[int, int]) -> Any:
-    """A result with the padding around its images taken off."""
-    height, width = size
-
-    def crop(image: Any) -> Any:
-        if image.ndim < 2 or image.shape[:2] == size:
-            return image
-        return jnp.asarray(np.asarray(image)[:height, :width])
-
-    return jax.tree.map(crop, result)
 
 
 def _at_once(job: Any, frame: Frame, divergence: Array | None, canvas: tuple[int, int]) -> Any:
@@ -445,11 +218,6 @@ def _canvas(frame: Frame, asked: tuple[int, int] | None = None) -> tuple[int, in
             f"canvas is {asked}, expected (height, width) of at least {frame.size}, the frame's."
         )
     return asked[0], asked[1]
-
-
-def has_canvas(denoiser: Denoiser) -> bool:
-    """Whether it takes frames padded beyond their true size."""
-    return getattr(denoiser, "canvas", False)
 
 
 def _traced(values: Any) -> bool:

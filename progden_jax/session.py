@@ -12,21 +12,14 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from progden_jax import _checks, skipping, tiling
+from progden_jax._canvas import canvas_size
+from progden_jax._program import Job, Valid, core_mask, prepare
 from progden_jax._windowed import Place, what_was_skipped
 from progden_jax.denoisers import Denoiser
 from progden_jax.divergence import Method
 from progden_jax.frame import Frame, Repairs
 from progden_jax.mixing import Mixer
-from progden_jax.pipeline import (
-    Job,
-    Result,
-    Valid,
-    canvas_size,
-    core_mask,
-    job_of,
-    prepare,
-    rule_of,
-)
+from progden_jax.pipeline import Result, job_of, rule_of
 from progden_jax.skipping import Skip, Skipped
 from progden_jax.survey import BUFFERS, frame_of
 from progden_jax.tiling import Window

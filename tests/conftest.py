@@ -27,6 +27,12 @@ def real_frame() -> pd.Frame:
     return pd.read_exr(sorted(DEMO.glob("*_000008spp.exr"))[0])
 
 
+@pytest.fixture(scope="session")
+def near_sighted() -> pd.Denoiser:
+    """A denoiser small enough to look only a few pixels far."""
+    return pd.denoisers.KPCN.init(jax.random.key(0), layers=2, width=8)
+
+
 @pytest.fixture
 def images() -> SimpleNamespace:
     """A random noisy image x (13×18), a smoother y, a variance with zeros, a divergence, float32."""

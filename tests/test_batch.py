@@ -30,7 +30,7 @@ def frames(real_frame):
 def test_batched_is_single_in_order_and_few_programs(frames, denoiser):
     with counting_compilations() as compiled:
         found = list(pd.denoise_batch(frames, denoiser, outputs=("image", "alpha"), skip=False))
-    assert compiled.count("_progressive") <= batch.PROGRAMS, compiled
+    assert compiled.count("progressive") <= batch.PROGRAMS, compiled
     for frame, result in zip(frames, found, strict=True):
         assert result.image.shape == frame.color.shape
     for frame, result in list(zip(frames, found, strict=True))[1:3]:

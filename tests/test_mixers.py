@@ -8,7 +8,7 @@ from conftest import drawn
 from jax import lax
 
 import progden_jax as pd
-from progden_jax import mixers, pipeline
+from progden_jax import _program, mixers
 from progden_jax._convolution import same_convolution, upsampled_convolution
 from progden_jax.cli import main
 from progden_jax.mixers import multiscale
@@ -128,10 +128,10 @@ def test_in_the_pipeline(either, images):
     denoiser = pd.FunctionDenoiser(lambda x: 0.5 * x + 0.1)
     frame = pd.Frame(images.x, images.variance)
     result = pd.progressive_denoise(frame, denoiser, mixer=either)
-    size = pipeline._progressive._cache_size()
+    size = _program.progressive._cache_size()
     other = pd.NetworkMixer(jax.tree.map(lambda p: 2 * p, either.params), either.architecture)
     changed = pd.progressive_denoise(frame, denoiser, mixer=other)
-    assert pipeline._progressive._cache_size() == size
+    assert _program.progressive._cache_size() == size
     assert not np.allclose(changed.alpha, result.alpha)
     y, divergence, risk = result.denoised, result.divergence, result.sure
     alpha = jax.jit(

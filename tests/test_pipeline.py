@@ -7,7 +7,7 @@ import pytest
 from conftest import counting_compilations
 
 import progden_jax as pd
-from progden_jax.pipeline import canvas_size
+from progden_jax._canvas import canvas_size
 
 # Most frames here are padded to 48×48 pixels and have the same buffers, so that one program serves them.
 

@@ -11,12 +11,6 @@ import progden_jax as pd
 
 
 @pytest.fixture(scope="module")
-def denoiser():
-    """Small enough to look only a few pixels far."""
-    return pd.denoisers.KPCN.init(jax.random.key(0), layers=2, width=8)
-
-
-@pytest.fixture(scope="module")
 def growing(real_frame):
     """A render that becomes right from the left."""
     frame = mirrored(real_frame, 150, 333)
@@ -29,8 +23,8 @@ def growing(real_frame):
 
 
 @pytest.fixture(scope="module")
-def session(denoiser):
-    return pd.Session(denoiser, (150, 333), mixer=pd.ClosedForm(), outputs=("image", "alpha"))
+def session(near_sighted):
+    return pd.Session(near_sighted, (150, 333), mixer=pd.ClosedForm(), outputs=("image", "alpha"))
 
 
 def alone(frame, denoiser):
@@ -39,12 +33,12 @@ def alone(frame, denoiser):
     )
 
 
-def test_updates_are_single_calls(growing, denoiser, session):
+def test_updates_are_single_calls(growing, near_sighted, session):
     for frame in growing:
         session.update(frame)
     session.wait()
     for frame, share in zip(growing, (0, 0.45, 0.7, 1), strict=True):
-        found, expected = session.update(frame), alone(frame, denoiser)
+        found, expected = session.update(frame), alone(frame, near_sighted)
         assert_same(found.image, expected.image)
         assert np.quantile(np.abs(found.alpha - expected.alpha), 0.99) < 1e-4
         np.testing.assert_allclose(found.mean_alpha, expected.mean_alpha, rtol=1e-4, atol=1e-7)
@@ -74,8 +68,8 @@ def test_nothing_is_compiled_in_the_callers_time(growing, session):
     assert compiled == []
 
 
-def test_the_whole_frame_until_the_windows_program_is_there(growing, denoiser):
-    held = pd.Session(denoiser, (150, 333), mixer=pd.ClosedForm(), outputs=("image",))
+def test_the_whole_frame_until_the_windows_program_is_there(growing, near_sighted):
+    held = pd.Session(near_sighted, (150, 333), mixer=pd.ClosedForm(), outputs=("image",))
     held.wait()
     first = held.update(growing[2])
     held.wait()
@@ -133,7 +127,7 @@ def test_denoisers_that_are_no_pytrees(growing):
     assert np.array_equal(session.update(growing[-1]).image, growing[-1].color)
 
 
-def test_what_a_session_refuses(growing, denoiser, session):
+def test_what_a_session_refuses(growing, near_sighted, session):
     with pytest.raises(ValueError, match=r"64×32 pixels \(width × height\).* are 333×150"):
         session.update(
             pd.Frame(np.zeros((32, 64, 3), np.float32), np.zeros((32, 64, 3), np.float32))
@@ -141,6 +135,6 @@ def test_what_a_session_refuses(growing, denoiser, session):
     with pytest.raises(ValueError, match=r"has no variance, expected color, variance"):
         session.update(pd.Frame(growing[0].color, None))
     with pytest.raises(ValueError, match="size is"):
-        pd.Session(denoiser, (0, 5))
+        pd.Session(near_sighted, (0, 5))
     with pytest.raises(ValueError, match="'noise', expected one of"):
-        pd.Session(denoiser, (8, 8), outputs=["noise"])
+        pd.Session(near_sighted, (8, 8), outputs=["noise"])

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.special import expit, ndtr
 
 import progden_jax as pd
-from progden_jax import _windows, pipeline
+from progden_jax import _program, _windows
 
 
 def dense_t_bound(alpha, x, y, variance, a=2.0, c=4.2, window=11, shift=True, sigmoid="normal"):
@@ -192,12 +192,12 @@ def test_the_chain_takes_other_bounds_in_one_program(images):
     frame = pd.Frame(images.x, images.variance)
     denoiser = pd.FunctionDenoiser(lambda x: 0.6 * x + 0.1)
     free = pd.progressive_denoise(frame, denoiser, bound=False)
-    before = pipeline._progressive._cache_size()
+    before = _program.progressive._cache_size()
     for bound in (pd.Bound(), pd.Bound(a=1.0, c=0.5), pd.Bound(c=-3.0)):
         found = pd.progressive_denoise(frame, denoiser, bound=bound)
         expected = bound(free.alpha, frame.color, free.denoised, frame.variance)
         np.testing.assert_allclose(found.alpha, expected, rtol=1e-5, atol=1e-6)
-    assert pipeline._progressive._cache_size() == before + 1
+    assert _program.progressive._cache_size() == before + 1
 
 
 def test_nothing_is_skipped_that_a_bound_would_not_hold_back():

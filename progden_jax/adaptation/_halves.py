@@ -8,7 +8,7 @@ from jaxtyping import Array
 from progden_jax import _checks
 from progden_jax._numeric import safe_sqrt
 from progden_jax.divergence import _random
-from progden_jax.frame import Frame, repair
+from progden_jax.frame import Frame, repaired
 
 _DIFFERING = ("color", "albedo", "normal", "depth")
 
@@ -45,7 +45,7 @@ def halves(a: Frame, b: Frame) -> Halves:
     for name, color in (("a.color", a.color), ("b.color", b.color)):
         _checks.image(name, color)
     _checks.same_shape("b.color", b.color, "a.color", a.color)
-    a, b = _repaired(a), _repaired(b)
+    a, b = repaired(a), repaired(b)
     mean, difference = {}, {}
     for name in _DIFFERING:
         first, second = getattr(a, name), getattr(b, name)
@@ -81,7 +81,7 @@ def split(frame: Frame, key: jax.Array) -> Halves:
             "the frame has no variance, and its halves are made with it: give one, or two renders to "
             "`halves(a, b)`."
         )
-    frame = _repaired(frame)
+    frame = repaired(frame)
     noise = safe_sqrt(cast(Array, frame.variance)) * _random.normal(key, 0, frame.color)
     return Halves(frame, {"color": noise})
 
@@ -105,8 +105,3 @@ def separate(frame: Frame, difference: dict[str, Array]) -> tuple[Frame, Frame]:
         return frame.replace(**shared, **changed)
 
     return half(1), half(-1)
-
-
-@jax.jit
-def _repaired(frame: Frame) -> Frame:
-    return repair(frame)[0]

@@ -6,12 +6,12 @@ from typing import Any
 import jax
 from jaxtyping import Array, Float
 
+from progden_jax._program import checked_variance
 from progden_jax.denoisers import Denoiser
 from progden_jax.denoisers._base import Bound
 from progden_jax.divergence import MonteCarlo
 from progden_jax.frame import Frame
 from progden_jax.mixing import Mixer
-from progden_jax.pipeline import checked_variance
 from progden_jax.sure import sure
 
 

@@ -18,14 +18,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from progden_jax import _checks
+from progden_jax._program import checked_variance
 from progden_jax.adaptation._mixed import Mixed, bind, exposure_of
 from progden_jax.adaptation._running import OPTIMIZER, Progress, descended, generator
 from progden_jax.denoisers import Denoiser
 from progden_jax.denoisers._base import passable
 from progden_jax.divergence import MonteCarlo
-from progden_jax.frame import Frame, repair
+from progden_jax.frame import Frame, repaired
 from progden_jax.mixing import Mixer
-from progden_jax.pipeline import checked_variance
 from progden_jax.sure import sure
 
 _FIT, _CHOOSE, _TELL = range(3)
@@ -150,7 +150,7 @@ def _fit(
     progress: Progress,
 ) -> Adapted:
     checked_variance(frame)
-    frame = _repaired(frame)
+    frame = repaired(frame)
     step_key, look_key, host_key = jax.random.split(key, 3)
     host = generator(host_key)
     kinds = _kinds(frame.size, adaptation.block, host)
@@ -237,11 +237,6 @@ def adapt_mixer(
     chosen = tuple(before + number for number in _weights(mixer, adaptation.only))
     found = _fit(frame, mixed, chosen, adaptation, fit_key, progress)
     return found._replace(adapted=found.adapted.mixer)
-
-
-@jax.jit
-def _repaired(frame: Frame) -> Frame:
-    return repair(frame)[0]
 
 
 def _weights(tree: Any, only: Sequence[str]) -> tuple[int, ...]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from progden_jax.cli._progress import timed
+from progden_jax.cli._progress import Shown, timed
 from progden_jax.cli._run import FAILED, OK, UsageError, complain, print_json, tables
 
 if TYPE_CHECKING:
@@ -190,32 +190,25 @@ def print_plan(plan: "Plan", *, json: bool) -> None:
     print(f"{len(methods)} methods × {items} renders = {total} rows")
 
 
-class _Report:
+class _Report(Shown):
     """A bar on stderr if that is a terminal; failures as lines there, whatever it is."""
 
     def __init__(self) -> None:
         self.failures: list[str] = []
-        self._bar = timed("rows")
-        self._task = self._bar.add_task("", total=None, name="reading")
-
-    def __enter__(self) -> "_Report":
-        self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
+        self.bars = timed("rows")
+        self._task = self.bars.add_task("", total=None, name="reading")
 
     def started(self, missing: int, present: int) -> None:
-        self._bar.update(self._task, total=missing, name="compiling")
+        self.bars.update(self._task, total=missing, name="compiling")
 
     def added(self, job: "Job", rows: int) -> None:
-        self._bar.update(self._task, advance=rows, name=f"{job.item.scene}, {job.item.spp} spp")
+        self.bars.update(self._task, advance=rows, name=f"{job.item.scene}, {job.item.spp} spp")
 
     def failed(self, job: "Job", reason: str) -> None:
         path = str(job.item.path)
         self.failures.append(reason if path in reason else f"{path}: {reason}")
         complain(self.failures[-1])
-        self._bar.update(self._task, advance=len(job.cells))
+        self.bars.update(self._task, advance=len(job.cells))
 
 
 def _means(shown: "list[Summary]") -> dict[str, Any]:

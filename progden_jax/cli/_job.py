@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import numpy as np
@@ -27,6 +27,7 @@ from progden_jax.compilation import cache_folder
 from progden_jax.divergence.running import ExactRun
 from progden_jax.exr import ExrInfo, read_exr_with_info, write_exr
 from progden_jax.exr._file import load
+from progden_jax.frame import repaired
 from progden_jax.pipeline import OUTPUTS
 
 
@@ -197,12 +198,8 @@ def _reference(item: Item, frame: pd.Frame, outcome: Outcome) -> np.ndarray:
     if not np.isfinite(color).all():
         bad = int((~np.isfinite(color)).any(-1).sum())
         outcome.warnings.append(f"the reference has {bad} pixels of NaN or infinity, filled in")
-        color = _repaired(found)
+        color = np.asarray(repaired(found).color)
     return color
-
-
-def _repaired(frame: pd.Frame) -> np.ndarray:
-    return np.asarray(jax.jit(pd.repair)(frame)[0].color)
 
 
 def _denoise(
@@ -273,8 +270,9 @@ def _exactly(
     progress: Progress,
 ) -> tuple[jax.Array, Path | None]:
     """The exact divergence, and the checkpoint that holds it."""
-    repaired = jax.jit(pd.repair)(frame)[0]
-    run = ExactRun(denoiser.bind(repaired), repaired.color, repaired.variance, method=method)
+    frame = repaired(frame)
+    variance = cast(jax.Array, frame.variance)
+    run = ExactRun(denoiser.bind(frame), frame.color, variance, method=method)
     checkpoint: Path | None = cache_folder() / "exact" / f"{run.key}.npz"
     try:
         checkpoint.parent.mkdir(parents=True, exist_ok=True)
@@ -294,7 +292,7 @@ def _exactly(
 def _measure(images: _Images, frame: pd.Frame, reference: np.ndarray) -> Scores:
     noisy = np.asarray(frame.color)
     if not np.isfinite(noisy).all():
-        noisy = _repaired(frame)
+        noisy = np.asarray(repaired(frame).color)
     compared = {"noisy": noisy, "denoised": images.maps["denoised"]}
     if frame.variance is not None:
         compared["mixed"] = images.image

@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -41,6 +41,19 @@ def timed(unit: str = "", *, percent: bool = False, **options: Any) -> "Progress
         disable=not console.is_terminal,
         **options,
     )
+
+
+class Shown:
+    """A context in which `bars` are shown."""
+
+    bars: "Progress"
+
+    def __enter__(self) -> Self:
+        self.bars.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.bars.stop()
 
 
 @contextlib.contextmanager

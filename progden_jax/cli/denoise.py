@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Self
 
 from cyclopts import Parameter
 
@@ -18,7 +18,7 @@ from progden_jax.cli._options import (
     parse_save,
 )
 from progden_jax.cli._paths import Item, plan
-from progden_jax.cli._progress import timed
+from progden_jax.cli._progress import Shown, timed
 from progden_jax.cli._run import (
     FAILED,
     OK,
@@ -192,7 +192,7 @@ def _about(path: str, message: str) -> str:
     return message if message.startswith(path) else f"{path}: {message}"
 
 
-class _Bars:
+class _Bars(Shown):
     """Progress on stderr if that is a terminal: of the files if they are many, and of what is long."""
 
     def __init__(self, total: int) -> None:
@@ -202,13 +202,8 @@ class _Bars:
         self.part: TaskID | None = None
         self.name = ""
 
-    def __enter__(self) -> "_Bars":
-        if self.many:
-            self.bars.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.bars.stop()
+    def __enter__(self) -> Self:
+        return super().__enter__() if self.many else self
 
     def advance(self, name: str) -> None:
         """On to the next file."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from progden_jax.cli._paths import make_folder
-from progden_jax.cli._progress import timed
+from progden_jax.cli._progress import Shown, timed
 from progden_jax.cli._run import FAILED, OK, Failure, UsageError, complain, explain, show
 
 if TYPE_CHECKING:
@@ -226,19 +226,12 @@ def _save_preview(job: "Job", folder: Path) -> None:
         imsave(beside, sheet.display(color, sheet.exposure_for(color)))
 
 
-class _Bar:
+class _Bar(Shown):
     """Samples per pixel that are taken and the time left, on stderr if that is a terminal."""
 
     def __init__(self, total: int) -> None:
         self.bars = timed(percent=True, speed_estimate_period=120)
         self._task = self.bars.add_task("", total=total, name="")
-
-    def __enter__(self) -> "_Bar":
-        self.bars.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.bars.stop()
 
     def run(self, job: "Job", folder: Path, *, force: bool) -> list[Path]:
         """Render the job, its progress on the bar."""

@@ -4,10 +4,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
 import progden_jax as pd
+from progden_jax.frame import repaired
 from progden_jax.training.config import Meaning, RunConfig
 from progden_jax.training.estimates import EstimateCache
 from progden_jax.training.index import Item, index, split
@@ -129,9 +129,6 @@ def load_split(
     return first, last
 
 
-_repair = jax.jit(lambda frame: pd.repair(frame)[0])
-
-
 def _repaired(item: Item, variance_of: Meaning, *, reference: bool = False) -> pd.Frame:
     if reference:
         frame = pd.read_exr(item.reference, auxiliary=False).replace(variance=None, spp=None)
@@ -142,7 +139,7 @@ def _repaired(item: Item, variance_of: Meaning, *, reference: bool = False) -> p
             raise ValueError(
                 f"{item.path} has no variance, and training needs that of the sample mean."
             )
-    return _repair(frame)
+    return repaired(frame)
 
 
 def _size(size: Sequence[int]) -> str:
