@@ -88,12 +88,14 @@ def assemble(
     With `devices` the windows, of one shape, are computed on all of them at once.
     """
     whole = survey(frame)
-    color = whole.buffers["color"]
+    color = whole.repaired("color")
     # What no window fills in is x and α = 0.
-    images = {
-        name: color.copy() if name == "image" else np.zeros_like(color) for name in job.outputs
-    }
-    exposure = exposure_of(color, job.denoiser) if windows else None
+    images = {name: np.zeros_like(color) for name in job.outputs if name != "image"}
+    if "image" in job.outputs:
+        # Where it was repaired it is a copy already.
+        images["image"] = color if "color" in whole.patches else color.copy()
+    # Known before the image, which may be the same memory, is written to.
+    exposure = jax.block_until_ready(exposure_of(color, job.denoiser)) if windows else None
     sums = dict.fromkeys(_MEANS, 0.0)
     denoised, computed = 0, 0
     if skip is not None:
@@ -126,20 +128,19 @@ _MEANS = ("mean_alpha", "mean_sure")
 
 def _is_noisy(whole: Survey, window: Window, skip: Skip) -> bool:
     """Whether a pixel of the core, or beside it, is not right yet."""
-    near = tuple(
-        slice(max(begin - skipping.MARGIN, 0), end + skipping.MARGIN)
-        for begin, end in (window.rows, window.columns)
-    )
-    color, variance = whole.buffers["color"][near], whole.buffers["variance"][near]
+    spans = [
+        (max(begin - skipping.MARGIN, 0), min(end + skipping.MARGIN, n))
+        for (begin, end), n in zip((window.rows, window.columns), whole.size, strict=True)
+    ]
+    origin, shape = zip(*((begin, end - begin) for begin, end in spans), strict=True)
+    color, variance = (whole.window(name, origin, shape) for name in ("color", "variance"))
     return bool(skipping.noisy(cast(Any, color), cast(Any, variance), skip.tolerance, np).any())
 
 
 def _arguments(
     whole: Survey, divergence: Array | None, exposure: Any, window: Window
 ) -> tuple[Any, ...]:
-    buffers = {
-        name: crop(buffer, window.origin, window.shape) for name, buffer in whole.buffers.items()
-    }
+    buffers = {name: whole.window(name, window.origin, window.shape) for name in whole.buffers}
     if divergence is not None:
         divergence = cast(Any, crop(divergence, window.origin, window.shape))
     valid = tuple(
@@ -161,7 +162,7 @@ def _compiled(job: Any, frame: Frame, divergence: Array | None, edge: int) -> An
         for name in BUFFERS
         if getattr(frame, name) is not None
     }
-    whole = Survey(zeros, cast(Any, None), dtype.type(0), dtype.type(0))
+    whole = Survey(zeros, {}, cast(Any, None), dtype.type(0), dtype.type(0))
     given = None if divergence is None else zeros["color"]
     window = Window((0, 0), (edge, edge), (0, edge), (0, edge))
     exposure = exposure_of(np.zeros((1, 1, 3), dtype), job.denoiser)

@@ -18,18 +18,28 @@ _REPAIR_RADIUS = 2
 """`repair` looks at the 5×5 around a bad pixel."""
 
 
+class Patches(NamedTuple):
+    """Pixels of a buffer that were repaired, by rows: where they are, (n,) each, and their values, (n, C)."""
+
+    rows: np.ndarray
+    columns: np.ndarray
+    values: np.ndarray
+
+
 class Survey(NamedTuple):
-    """A frame on the host with its bad values repaired, and what depends on all of it.
+    """A frame on the host, how its bad values are repaired, and what depends on all of it.
 
     Attributes
     ----------
-    buffers : name -> (H, W, C), of those that the frame has.
+    buffers : name -> (H, W, C), of those that the frame has, as they came.
+    patches : of the buffers that have bad values: a huge frame is not copied for a few of them.
     repairs : counts of bad pixels.
     mean_variance : over pixels and channels; 0 without a variance.
     level : mean over pixels and channels of the radiance above 0.
     """
 
     buffers: dict[str, np.ndarray]
+    patches: dict[str, Patches]
     repairs: Repairs
     mean_variance: np.floating
     level: np.floating
@@ -40,40 +50,62 @@ class Survey(NamedTuple):
         height, width = self.buffers["color"].shape[:2]
         return height, width
 
+    def repaired(self, name: str) -> np.ndarray:
+        """A whole buffer; the frame's own where nothing in it is bad."""
+        return self.window(name, (0, 0), self.size)
+
+    def window(self, name: str, origin: tuple[int, int], shape: tuple[int, int]) -> np.ndarray:
+        """A window of a buffer repaired, see `crop`."""
+        part = crop(self.buffers[name], origin, shape)
+        if name not in self.patches:
+            return part
+        rows, columns, values = self.patches[name]
+        begin, end = np.searchsorted(rows, (origin[0], origin[0] + shape[0]))
+        rows, columns = rows[begin:end] - origin[0], columns[begin:end] - origin[1]
+        hit = (columns >= 0) & (columns < shape[1])
+        if hit.any():
+            part = part.copy()
+            part[rows[hit], columns[hit]] = values[begin:end][hit]
+        return part
+
 
 def survey(frame: Frame) -> Survey:
-    """See `Survey`. Finite buffers are not copied."""
+    """See `Survey`."""
     buffers = {
         name: np.asarray(getattr(frame, name))
         for name in BUFFERS
         if getattr(frame, name) is not None
     }
-    given, copied = dict(buffers), set()
+    changes: dict[str, list[Patches]] = {}
     counts = np.zeros(len(Repairs._fields), np.int64)
     noise, light = 0.0, 0.0
     height = frame.size[0]
     for top in range(0, height, _BAND):
         bottom = min(top + _BAND, height)
-        band = {name: buffer[top:bottom] for name, buffer in given.items()}
+        band = {name: buffer[top:bottom] for name, buffer in buffers.items()}
         if _negative_color(band) or not _sound(band):
             first, last = max(top - _REPAIR_RADIUS, 0), min(bottom + _REPAIR_RADIUS, height)
-            around = {name: buffer[first:last] for name, buffer in given.items()}
+            around = {name: buffer[first:last] for name, buffer in buffers.items()}
             fixed, _ = _repair(frame_of(around))
             _, found = _repair(frame_of(band))
             counts += np.asarray(jax.device_get(list(found)), np.int64)
-            if not _sound(band):
-                for name in given:
-                    if name not in copied:
-                        buffers[name] = buffers[name].copy()
-                        copied.add(name)
-                    mended = np.asarray(getattr(fixed, name))
-                    buffers[name][top:bottom] = mended[top - first : bottom - first]
-        if "variance" in buffers:
-            noise += float(buffers["variance"][top:bottom].sum(dtype=np.float64))
-        light += float(np.maximum(buffers["color"][top:bottom], 0).sum(dtype=np.float64))
+            for name, given in band.items():
+                mended = np.asarray(getattr(fixed, name))[top - first : bottom - first]
+                rows, columns = np.nonzero((mended != given).any(-1))
+                if rows.size:
+                    values = mended[rows, columns]
+                    changes.setdefault(name, []).append(Patches(rows + top, columns, values))
+                band[name] = mended
+        if "variance" in band:
+            noise += float(band["variance"].sum(dtype=np.float64))
+        light += float(np.maximum(band["color"], 0).sum(dtype=np.float64))
     scalar, size = buffers["color"].dtype.type, buffers["color"].size
     repairs = Repairs(*(jnp.asarray(n, jnp.int32) for n in counts))
-    return Survey(buffers, repairs, scalar(noise / size), scalar(light / size))
+    patches = {
+        name: Patches(*map(np.concatenate, zip(*found, strict=True)))
+        for name, found in changes.items()
+    }
+    return Survey(buffers, patches, repairs, scalar(noise / size), scalar(light / size))
 
 
 def _negative_color(band: dict[str, np.ndarray]) -> bool:

@@ -135,7 +135,8 @@ def _reference(path: Path, variance_of: Any) -> _Pair:
 
 
 def _sound(frame: pd.Frame) -> pd.Frame:
-    return frame_of(survey(frame).buffers)
+    found = survey(frame)
+    return frame_of({name: found.repaired(name) for name in found.buffers})
 
 
 def _estimate(frame: pd.Frame, settings: Settings, max_memory: int | None) -> _Estimate:
