@@ -62,20 +62,6 @@ def series(
                 yield name, count, pd.read_exr(path), reference
 
 
-def centre(frame: pd.Frame, size: int) -> pd.Frame:
-    """The middle size × size pixels of every buffer."""
-    if size > min(frame.size):
-        height, width = frame.size
-        raise ValueError(f"the crop is {size} pixels wide, the frame {width}×{height}.")
-    top, left = ((n - size) // 2 for n in frame.size)
-    changed = {
-        name: buffer[top : top + size, left : left + size]
-        for name in ("color", "variance", "albedo", "normal", "depth")
-        if (buffer := getattr(frame, name)) is not None
-    }
-    return frame.replace(**changed)
-
-
 def machine() -> str:
     """One line on where this runs."""
     cpu = platform.processor() or platform.machine()

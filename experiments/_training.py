@@ -5,19 +5,21 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import progden_jax as pd
 from experiments import _common
-from progden_jax.training import MixerConfig, MixerTask, config, loop, train
+from progden_jax.training import MixerConfig, MixerTask, config, train
 from progden_jax.training.evaluation import Scores
 
+RUNS = Path(__file__).resolve().parents[1] / "runs"
+"""Where configurations of sweeps look for what was trained."""
 
-def parser(description: str | None) -> argparse.ArgumentParser:
-    """A command line with --data, --output and --set."""
+
+def parser(description: str | None, name: str) -> argparse.ArgumentParser:
+    """A command line with --data, --output, by default `RUNS` / name, and --set."""
     made = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     made.add_argument("--data", type=Path, default=_common.TRAIN)
-    made.add_argument("--output", type=Path, required=True, help="folder of the runs")
+    made.add_argument("--output", type=Path, default=RUNS / name, help="folder of the runs")
     made.add_argument(
         "--set", nargs="*", default=(), metavar="FIELD=VALUE", help="over every configuration's"
     )
@@ -41,13 +43,6 @@ def train_all(runs: Mapping[str, MixerConfig], output: Path) -> None:
     """Each run in a folder of its own; goes on where it was killed, and leaves alone what is done."""
     for name, chosen in runs.items():
         train(MixerTask(chosen), output / name, report=_Lines(name))
-
-
-def trained(runs: Path | None, names: Mapping[str, Any]) -> dict[str, pd.NetworkMixer]:
-    """The weights of those runs in the folder that have some."""
-    files = {} if runs is None else {name: runs / name / loop.WEIGHTS for name in names}
-    found = {name: pd.load_mixer(file) for name, file in files.items() if file.exists()}
-    return {name: mixer for name, mixer in found.items() if isinstance(mixer, pd.NetworkMixer)}
 
 
 class _Lines:

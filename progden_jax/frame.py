@@ -131,6 +131,26 @@ class Repairs(NamedTuple):
     nonfinite_auxiliary: Int[Array, ""]
 
 
+def centre(frame: Frame, size: int) -> Frame:
+    """The middle size × size pixels of every buffer.
+
+    Raises
+    ------
+    ValueError
+        If the frame has less.
+    """
+    if size > min(frame.size):
+        height, width = frame.size
+        raise ValueError(f"the crop is {size} pixels wide, the frame {width}×{height}.")
+    top, left = ((n - size) // 2 for n in frame.size)
+    changed = {
+        name: buffer[top : top + size, left : left + size]
+        for name in ("color", "variance", "albedo", "normal", "depth")
+        if (buffer := getattr(frame, name)) is not None
+    }
+    return frame.replace(**changed)
+
+
 def repair(frame: Frame, *, inside: Bool[Array, "h w 1"] | None = None) -> tuple[Frame, Repairs]:
     """The frame with every value finite and every variance at least zero, and what that took.
 

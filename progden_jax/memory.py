@@ -57,6 +57,35 @@ def resident() -> int:
     return pages * os.sysconf("SC_PAGE_SIZE")
 
 
+class Peak:
+    """The memory that is taken from now on, beyond what is held now: of JAX's device, or of this process."""
+
+    def __init__(self) -> None:
+        trim()
+        self._stats = jax.devices()[0].memory_stats() or {}
+        self._held, self._told = resident(), False
+        # The kernel's record of the highest begins anew.
+        with contextlib.suppress(OSError):
+            Path("/proc/self/clear_refs").write_text("5")
+            self._told = True
+
+    def read(self) -> int | None:
+        """Bytes; None where the system does not tell, as a device that had held as much before."""
+        if self._stats:
+            highest = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use", 0)
+            grown = highest > self._stats.get("peak_bytes_in_use", 0)
+            return highest - self._stats["bytes_in_use"] if grown else None
+        highest = re.search(r"VmHWM:\s*(\d+) kB", _status()) if self._told else None
+        return max(int(highest[1]) * 1024 - self._held, 0) if highest else None
+
+
+def _status() -> str:
+    try:
+        return Path("/proc/self/status").read_text()
+    except OSError:
+        return ""
+
+
 def trim() -> None:
     """Give back what was freed: a compiler leaves some hundred MB to the C library, which keeps them."""
     with contextlib.suppress(OSError, AttributeError):  # no glibc

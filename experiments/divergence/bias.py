@@ -15,6 +15,7 @@ import numpy as np
 
 import progden_jax as pd
 from experiments import _common
+from progden_jax.frame import centre
 
 FRAMES = (("proc2002", 8), ("proc2003", 128))
 METHODS: dict[str, pd.Method] = {
@@ -56,7 +57,7 @@ def main() -> None:
     rows = []
     for scene, spp in FRAMES:
         path = arguments.data / f"{scene}_{spp:06}spp.exr"
-        frame, _ = pd.repair(_common.centre(pd.read_exr(path), arguments.size))
+        frame, _ = pd.repair(centre(pd.read_exr(path), arguments.size))
         assert frame.variance is not None
         x, variance = jnp.asarray(frame.color), jnp.asarray(frame.variance)
         f = denoiser.bind(frame)

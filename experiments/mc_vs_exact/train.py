@@ -1,6 +1,6 @@
 """Train a mixer with the exact divergence, and with probes, all with the same budget.
 
-python -m experiments.mc_vs_exact.train --data ../shared/data/train --output runs/mc_vs_exact
+python -m experiments.mc_vs_exact.train
 
 On centre crops, which the exact divergence is affordable for, and with OIDN's small network. Goes on where it
 was killed; the divergences are kept in the user's cache folder.
@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import progden_jax as pd
-from experiments import _common, _training
+from experiments import _training
+from progden_jax.frame import centre
 from progden_jax.training.index import index
 
 DENOISER = "oidn-hdr-small"
@@ -44,11 +45,11 @@ def crop_all(data: Path, folder: Path, size: int, spp: tuple[int, ...]) -> None:
         for path in (item.path, item.reference):
             target = folder / path.name
             if not target.exists():
-                pd.write_exr(target, _common.centre(pd.read_exr(path), size))
+                pd.write_exr(target, centre(pd.read_exr(path), size))
 
 
 def main() -> None:
-    parser = _training.parser(__doc__)
+    parser = _training.parser(__doc__, "mc_vs_exact")
     parser.add_argument(
         "--crop", type=int, default=CROP, help="side of the crops, a multiple of 16"
     )

@@ -22,6 +22,7 @@ import progden_jax as pd
 from experiments import _common
 from experiments.stability import _figures, rounding
 from progden_jax.divergence import _random
+from progden_jax.frame import centre
 
 HERE = Path(__file__).parent
 EPSILONS = tuple(float(f"{10**e:.2g}") for e in np.arange(-6, -0.9, 0.5))
@@ -251,7 +252,7 @@ def main() -> None:
         writer.writerow(HEADER)
         frames = _common.series(arguments.data, names, arguments.spp)
         for number, (scene, spp, frame, _) in enumerate(frames):
-            small = _common.centre(pd.Frame(frame.color, frame.variance), arguments.size)
+            small = centre(pd.Frame(frame.color, frame.variance), arguments.size)
             for row in measure(
                 small,
                 arguments.denoiser,

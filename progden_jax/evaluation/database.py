@@ -13,10 +13,19 @@ from typing import Any, NamedTuple, Self
 FILE = "results.sqlite"
 IMAGES = "images"
 
-_VERSION = 1
-"""Of the table, kept as SQLite's user_version."""
+_VERSION = 2
+"""Of the table, kept as SQLite's user_version. What version 1 lacks is added before a file is written."""
 
-_SCHEMA = """
+_ADDED = {
+    "risk": "REAL",
+    "sure_error": "REAL",
+    "alpha": "REAL",
+    "memory": "INTEGER",
+    "crop": "INTEGER",
+}
+"""Columns that version 1 has not, and their types."""
+
+_SCHEMA = f"""
 CREATE TABLE results(
     key TEXT PRIMARY KEY,
     scene TEXT NOT NULL,
@@ -28,6 +37,7 @@ CREATE TABLE results(
     seconds REAL,
     render TEXT, reference TEXT, image TEXT,
     created TEXT NOT NULL,
+    {", ".join(f"{name} {kind}" for name, kind in _ADDED.items())},
     UNIQUE(method, scene, spp)
 )
 """
@@ -52,6 +62,13 @@ class Row(NamedTuple):
     render, reference : absolute paths.
     image : path relative to the run's folder; None where it was not kept.
     created : ISO 8601, UTC.
+    risk : the estimate of `mse` without the reference: the mean variance of the render, SURE of the denoised
+        image, and of a mix SURE with α held constant or, by the setting risk_probes, of the whole chain.
+    sure_error : standard error of `sure`, from the spread between pixels.
+    alpha : mean weight of the denoised image, after the bound; None where nothing is mixed.
+    memory : bytes that the images took at most, beyond what was held before; None where `seconds` is, and
+        where the system does not tell.
+    crop : side in pixels of the centre square that this is of; None: the whole image.
     """
 
     key: str
@@ -72,6 +89,11 @@ class Row(NamedTuple):
     reference: str
     image: str | None
     created: str
+    risk: float | None = None
+    sure_error: float | None = None
+    alpha: float | None = None
+    memory: int | None = None
+    crop: int | None = None
 
 
 def rows(run: str | os.PathLike[str]) -> list[Row]:
@@ -86,10 +108,12 @@ def rows(run: str | os.PathLike[str]) -> list[Row]:
     if not path.is_file():
         raise ValueError(f"{run} holds no {FILE}: name a folder that `progden evaluate` wrote.")
     with closing(_open(path)) as connection:
+        there = _columns(connection)
+        names = [name for name in Row._fields if name in there]
         found = connection.execute(
-            f"SELECT {', '.join(Row._fields)} FROM results ORDER BY scene, spp, rowid"
+            f"SELECT {', '.join(names)} FROM results ORDER BY scene, spp, rowid"
         ).fetchall()
-    return [_row(values) for values in found]
+    return [_row(dict(zip(names, values, strict=True))) for values in found]
 
 
 class Database:
@@ -144,12 +168,14 @@ class Database:
         """Add rows; each replaces what there is of its method, scene and samples per pixel."""
         values = [r._replace(settings=json.dumps(r.settings)) for r in rows]  # pyright: ignore
         places = [(row.method, row.scene, row.spp) for row in values]
-        marks = ", ".join("?" * len(Row._fields))
+        names, marks = ", ".join(Row._fields), ", ".join("?" * len(Row._fields))
         replaced: list[str] = []
         with self._connection:
             for place in places:
                 replaced += self._images_at(place)
-            self._connection.executemany(f"INSERT OR REPLACE INTO results VALUES({marks})", values)
+            self._connection.executemany(
+                f"INSERT OR REPLACE INTO results({names}) VALUES({marks})", values
+            )
         kept = {row.image for row in values}
         for image in replaced:
             if image not in kept:
@@ -205,11 +231,14 @@ def _open(path: Path, *, create: bool = False) -> sqlite3.Connection:
             # Both or none, for a process may be killed between them.
             connection.executescript(f"BEGIN; {_SCHEMA}; PRAGMA user_version = {_VERSION}; COMMIT;")
             version = _VERSION
+        elif create and version == 1:
+            _upgrade(connection)
+            version = _VERSION
     except sqlite3.Error as error:
         if connection is not None:
             connection.close()
         raise ValueError(f"{path} cannot be used as a database of results: {error}.") from None
-    if version != _VERSION:
+    if version not in (1, _VERSION):
         with suppress(sqlite3.Error):
             connection.close()
         raise ValueError(
@@ -219,6 +248,17 @@ def _open(path: Path, *, create: bool = False) -> sqlite3.Connection:
     return connection
 
 
-def _row(values: tuple[Any, ...]) -> Row:
-    row = Row(*values)
+def _upgrade(connection: sqlite3.Connection) -> None:
+    """Add what version 1 has not, all or nothing; what was measured before is not known then."""
+    missing = [name for name in _ADDED if name not in _columns(connection)]
+    added = "".join(f"ALTER TABLE results ADD COLUMN {n} {_ADDED[n]}; " for n in missing)
+    connection.executescript(f"BEGIN; {added}PRAGMA user_version = {_VERSION}; COMMIT;")
+
+
+def _columns(connection: sqlite3.Connection) -> set[str]:
+    return {name for _, name, *_ in connection.execute("PRAGMA table_info(results)")}
+
+
+def _row(values: dict[str, Any]) -> Row:
+    row = Row(**values)
     return row._replace(settings=json.loads(str(row.settings)))

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import time
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,13 +13,15 @@ from jaxtyping import Array, Float
 
 import progden_jax as pd
 from progden_jax import metrics
-from progden_jax.compilation import count_compilations
 from progden_jax.denoisers import Denoiser, Network
 from progden_jax.evaluation import parts
+from progden_jax.evaluation.cost import Cost, metered
 from progden_jax.evaluation.database import IMAGES, Row
 from progden_jax.evaluation.plan import Cell
+from progden_jax.evaluation.risk import risk_of_held, risk_of_mix
 from progden_jax.evaluation.settings import Settings
 from progden_jax.exr import write_exr
+from progden_jax.frame import centre
 from progden_jax.survey import frame_of, survey
 from progden_jax.training.config import Meaning
 from progden_jax.training.evaluation import oracle_alpha
@@ -36,12 +37,14 @@ class Job(NamedTuple):
     ----------
     cells : of one item, and of one `Settings.estimate` but for those that show the render.
     variance_of : what the files' variance channels hold.
+    crop : side of the centre square that is looked at; 0: the whole images.
     run : folder to keep images in; None: they are not kept.
     max_memory : see `progden_jax.progressive_denoise`.
     """
 
     cells: tuple[Cell, ...]
     variance_of: Meaning = "mean"
+    crop: int = 0
     run: Path | None = None
     max_memory: int | None = None
 
@@ -77,7 +80,7 @@ def _estimates(cell: Cell) -> bool:
 
 
 class _Pair(NamedTuple):
-    """A render and its reference, bad pixels repaired; `noise` is the reference's mean variance."""
+    """What is looked at of a render and its reference, repaired; `noise` is the reference's mean variance."""
 
     frame: pd.Frame
     reference: Image
@@ -85,21 +88,26 @@ class _Pair(NamedTuple):
 
 
 class _Estimate(NamedTuple):
-    """The denoised image and what is known of it; only the image without an estimator."""
+    """The denoised image and what is known of it; only the image without an estimator.
 
+    `frame` has the buffers that the denoiser takes and no more, which would make other programs of the same.
+    """
+
+    frame: pd.Frame
     denoiser: Denoiser
     denoised: Image
     divergence: Image | None
     sure: Image | None
-    seconds: float | None
+    cost: Cost
 
 
 class _Shown(NamedTuple):
-    """A method's image, α where it mixes, and what it took."""
+    """A method's image, the estimate of its mean squared error, α where it mixes, and what it took."""
 
     image: Any
+    risk: float | None = None
     alpha: Any = None
-    seconds: float | None = None
+    cost: Cost = Cost()
 
 
 def measure(job: Job) -> list[Row]:
@@ -110,28 +118,31 @@ def measure(job: Job) -> list[Row]:
     ValueError
         If a file cannot be read, sizes differ, or the render lacks what a method takes.
     """
-    pair = _read(job.item, job.variance_of)
+    pair = _read(job.item, job.variance_of, job.crop)
     estimate = None if job.shown is None else _estimate(pair.frame, job.shown, job.max_memory)
-    return [_row(cell, pair, estimate, job.run) for cell in job.cells]
+    return [_row(cell, pair, estimate, job) for cell in job.cells]
 
 
-def _read(item: Item, variance_of: Meaning) -> _Pair:
+def _read(item: Item, variance_of: Meaning, crop: int) -> _Pair:
     given = None if variance_of == "mean" else variance_of
     frame = pd.read_exr(item.path, variance_of=given)
     reference = _reference(item.reference, given)
-    if frame.size != reference.frame.size:
-        (height, width), (high, wide) = frame.size, reference.frame.size
+    if frame.size != reference.size:
+        (height, width), (high, wide) = frame.size, reference.size
         raise ValueError(
             f"{item.path} is {width}×{height} pixels but its reference {item.reference} is {wide}×{high}."
         )
-    return reference._replace(frame=_sound(frame))
+    try:
+        frame, truth = ((centre(f, crop) if crop else f) for f in (_sound(frame), reference))
+    except ValueError as error:
+        raise ValueError(f"{item.path}: {error}") from None
+    noise = 0.0 if truth.variance is None else _mean(truth.variance)
+    return _Pair(frame, np.asarray(truth.color), noise)
 
 
 @functools.lru_cache(maxsize=2)
-def _reference(path: Path, variance_of: Any) -> _Pair:
-    frame = _sound(pd.read_exr(path, variance_of=variance_of, auxiliary=False))
-    noise = 0.0 if frame.variance is None else _mean(frame.variance)
-    return _Pair(frame, np.asarray(frame.color), noise)
+def _reference(path: Path, variance_of: Any) -> pd.Frame:
+    return _sound(pd.read_exr(path, variance_of=variance_of, auxiliary=False))
 
 
 def _sound(frame: pd.Frame) -> pd.Frame:
@@ -142,14 +153,13 @@ def _sound(frame: pd.Frame) -> pd.Frame:
 def _estimate(frame: pd.Frame, settings: Settings, max_memory: int | None) -> _Estimate:
     denoiser = parts.denoiser_for(frame, settings)
     if isinstance(denoiser, Network):
-        # Buffers that it does not look at would make other programs of the same.
         taken = {n: getattr(frame, n) for n in ("color", "variance", *denoiser.inputs)}
         frame = frame_of({name: buffer for name, buffer in taken.items() if buffer is not None})
     method = settings.method()
     if method is None:
-        plain, seconds = _timed(lambda: pd.denoise(frame, denoiser, max_memory=max_memory))
-        return _Estimate(denoiser, np.asarray(plain.image), None, None, seconds)
-    found, seconds = _timed(
+        plain, cost = metered(lambda: pd.denoise(frame, denoiser, max_memory=max_memory))
+        return _Estimate(frame, denoiser, np.asarray(plain.image), None, None, cost)
+    found, cost = metered(
         lambda: pd.progressive_denoise(
             frame,
             denoiser,
@@ -162,7 +172,7 @@ def _estimate(frame: pd.Frame, settings: Settings, max_memory: int | None) -> _E
         )
     )
     denoised, divergence, risk = map(np.asarray, (found.denoised, found.divergence, found.sure))
-    return _Estimate(denoiser, denoised, divergence, risk, seconds)
+    return _Estimate(frame, denoiser, denoised, divergence, risk, cost)
 
 
 @jax.tree_util.register_dataclass
@@ -192,22 +202,36 @@ class _Nothing:
 
 def _show(settings: Settings, frame: pd.Frame, estimate: _Estimate | None) -> _Shown:
     if estimate is None or settings.image == "render":
-        return _Shown(frame.color)
+        return _Shown(frame.color, None if frame.variance is None else _mean(frame.variance))
     if settings.image == "denoised":
-        return _Shown(estimate.denoised, None, estimate.seconds)
-    found, seconds = _timed(
+        risk = None if estimate.sure is None else _mean(estimate.sure)
+        return _Shown(estimate.denoised, risk, cost=estimate.cost)
+    mixer = parts.mixer_for(estimate.denoiser, settings)
+    found, cost = metered(
         lambda: pd.progressive_denoise(
             pd.Frame(frame.color, frame.variance),
             _Known(estimate.denoised),
-            mixer=parts.mixer_for(estimate.denoiser, settings),
+            mixer=mixer,
             bound=settings.limits if settings.bound else False,
             divergence=cast(Any, estimate.divergence),
             outputs=("image", "alpha"),
             skip=False,
         )
     )
-    both = None if seconds is None or estimate.seconds is None else estimate.seconds + seconds
-    return _Shown(found.image, found.alpha, both)
+    if settings.risk_probes:
+        risk = risk_of_mix(
+            estimate.frame,
+            estimate.denoiser,
+            mixer,
+            settings.limits if settings.bound else None,
+            method=cast(pd.Method, settings.method()),
+            probes=settings.risk_probes,
+            seed=settings.seed,
+        )
+    else:
+        known: Any = (frame.color, estimate.denoised, frame.variance, estimate.divergence)
+        risk = float(risk_of_held(found.alpha, *known))
+    return _Shown(found.image, risk, found.alpha, estimate.cost.then(cost))
 
 
 @jax.jit
@@ -222,10 +246,11 @@ def _scores(image: Array, reference: Array) -> dict[str, Array]:
     return {name: getattr(metrics, name)(image, reference) for name in names}
 
 
-def _row(cell: Cell, pair: _Pair, estimate: _Estimate | None, run: Path | None) -> Row:
+def _row(cell: Cell, pair: _Pair, estimate: _Estimate | None, job: Job) -> Row:
     settings, frame = cell.method.settings, pair.frame
     if settings.image == "oracle" and estimate is not None:
-        shown = _Shown(*_oracle(frame.color, estimate.denoised, pair.reference))
+        best, alpha = _oracle(frame.color, estimate.denoised, pair.reference)
+        shown = _Shown(best, None, alpha)
     else:
         shown = _show(settings, frame, estimate)
     image = np.asarray(shown.image)
@@ -235,9 +260,9 @@ def _row(cell: Cell, pair: _Pair, estimate: _Estimate | None, run: Path | None) 
     scores["flip"] = metrics.flip(cast(Any, image), cast(Any, pair.reference))
     of = estimate if settings.image != "render" else None
     kept = None
-    if run is not None:
+    if job.run is not None:
         kept = f"{IMAGES}/{cell.key}.exr"
-        _keep(run / kept, image, shown, of)
+        _keep(job.run / kept, image, shown, of)
     return Row(
         key=cell.key,
         scene=cell.item.scene,
@@ -248,11 +273,16 @@ def _row(cell: Cell, pair: _Pair, estimate: _Estimate | None, run: Path | None) 
         mse=_squared_error(image, pair),
         sure=None if of is None or of.sure is None else _mean(of.sure),
         denoised_mse=None if of is None else _squared_error(of.denoised, pair),
-        seconds=shown.seconds,
+        seconds=shown.cost.seconds,
         render=str(cell.item.path),
         reference=str(cell.item.reference),
         image=kept,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
+        risk=shown.risk,
+        sure_error=None if of is None or of.sure is None else _standard_error(of.sure),
+        alpha=None if shown.alpha is None else _mean(shown.alpha),
+        memory=shown.cost.memory,
+        crop=job.crop or None,
     )
 
 
@@ -274,10 +304,7 @@ def _mean(values: Any) -> float:
     return float(np.asarray(values).mean(dtype=np.float64))
 
 
-def _timed(call: Callable[[], Any]) -> tuple[Any, float | None]:
-    """What it gives, and the seconds it took; None where a program was compiled, which takes longer."""
-    compiled = count_compilations()
-    start = time.perf_counter()
-    found = jax.block_until_ready(call())
-    seconds = time.perf_counter() - start
-    return found, seconds if count_compilations() == compiled else None
+def _standard_error(values: Image) -> float:
+    """Of the mean over pixels, whose channels go together."""
+    pixels = np.asarray(values, np.float64).mean(-1)
+    return float(pixels.std() / np.sqrt(pixels.size))

@@ -63,6 +63,14 @@ class Data:
     scenes: tuple[str, ...] = ()  # only these
     reference_spp: int = 0  # of the reference; 0: the highest of each scene
     variance_of: Meaning = "mean"  # what variance channels hold
+    crop: int = 0  # side in pixels of the centre square that is looked at; 0: the whole images
+    keep_images: tuple[int, ...] = ()  # samples per pixel whose images are kept unasked
+
+    def __post_init__(self) -> None:
+        if self.crop < 0:
+            raise ValueError(
+                f"crop is {self.crop}, expected a side in pixels, or 0 for the whole images."
+            )
 
     def items(self) -> list[Item]:
         """The renders, with absolute paths, sorted by scene and samples per pixel."""
@@ -111,6 +119,8 @@ class Plan:
         cells = []
         for item in self.items:
             files = [digest(item.path), digest(item.reference), self.data.variance_of]
+            if self.data.crop:
+                files.append(f"crop {self.data.crop}")
             for method in self.methods:
                 key = _hash([shared[method.label], item.scene, item.spp, *files])
                 cells.append(Cell(key, item, method))

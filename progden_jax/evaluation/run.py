@@ -9,6 +9,7 @@ from progden_jax.evaluation.database import FILE, Database
 from progden_jax.evaluation.dispatch import Failed, Here, Workers, dispatch
 from progden_jax.evaluation.measure import Job, jobs
 from progden_jax.evaluation.plan import Plan
+from progden_jax.training.index import Item
 
 
 class Report(Protocol):
@@ -50,7 +51,8 @@ def carry_out(
     ----------
     run : folder, made if missing.
     workers : told how many jobs there are, makes what does them; only called if there are any.
-    keep_images : rows without an image count as missing.
+    keep_images : of all rows, and not of those only whose samples per pixel the plan names; where they are to
+        be kept, rows without an image count as missing.
 
     Raises
     ------
@@ -61,10 +63,16 @@ def carry_out(
     cells = plan.cells()
     with Database(run) as database:
         _check_labels(plan, database)
-        known = database.known(with_images=keep_images)
-        missing = [cell for cell in cells if cell.key not in known]
-        rest: dict[str, Any] = {"variance_of": plan.data.variance_of, "max_memory": max_memory}
-        todo = jobs(missing, run=run if keep_images else None, **rest)
+        data = plan.data
+        known, shown = database.known(), database.known(with_images=True)
+
+        def keeps(item: Item) -> bool:
+            return keep_images or item.spp in data.keep_images
+
+        missing = [c for c in cells if c.key not in (shown if keeps(c.item) else known)]
+        rest: dict[str, Any] = {"variance_of": data.variance_of, "crop": data.crop}
+        made = jobs(missing, run=run, max_memory=max_memory, **rest)
+        todo = [job if keeps(job.item) else job._replace(run=None) for job in made]
         present = len(cells) - len(missing)
         report.started(len(missing), present)
         computed = failed = 0

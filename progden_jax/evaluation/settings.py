@@ -2,7 +2,7 @@
 
 import dataclasses
 import difflib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, Literal
 
 from progden_jax import _checks
@@ -41,6 +41,7 @@ class Settings:
     closed_form: ClosedForm = dataclasses.field(default_factory=ClosedForm)
     bound: bool = True  # whether α is bounded
     limits: Bound = dataclasses.field(default_factory=Bound)
+    risk_probes: int = 0  # for SURE of the mix through the whole chain; 0: with α held constant
 
     def __post_init__(self) -> None:
         _checks.choice("precision", self.precision, PRECISIONS)
@@ -48,6 +49,10 @@ class Settings:
         _checks.positive_int("probes", self.probes)
         if not 0 <= self.seed < 2**32:
             raise ValueError(f"seed is {self.seed}, expected 0 to {2**32 - 1}.")
+        if self.risk_probes < 0:
+            raise ValueError(
+                f"risk_probes is {self.risk_probes}, expected a whole number from 0 up."
+            )
         if self.estimator == NONE and self.image == "mix":
             raise ValueError(
                 "estimator is 'none' and image is 'mix': mixing needs SURE, and so a divergence; choose an "
@@ -89,11 +94,16 @@ class Settings:
                 part = getattr(self, _GROUPS[prefix][0])
                 if relevant:
                     values |= {f"{prefix}.{k}": v for k, v in dataclasses.asdict(part).items()}
+            if self.risk_probes:
+                values["risk_probes"] = self.risk_probes
         return values
 
-    def label(self) -> str:
-        """A name for people: what is not as by default. Files go by the last two parts of their paths."""
-        values = self.flat()
+    def label(self, without: Collection[str] = ()) -> str:
+        """A name for people: what is not as by default, but for some settings.
+
+        Files go by the last two parts of their paths.
+        """
+        values = {name: value for name, value in self.flat().items() if name not in without}
         usual = names()
         parts = [self.image]
         parts += [
@@ -101,7 +111,7 @@ class Settings:
         ]
         if any(values.get(n, usual[n]) != usual[n] for n in ("estimator", "probes")):
             probes = f"({self.probes})" if "probes" in values else ""
-            parts.append(f"{self.estimator}{probes}")
+            parts.append(f"{values.get('estimator', '')}{probes}")
         if not values.get("bound", True):
             parts.append("unbounded")
         said = ("image", "denoiser", "mixer", "estimator", "probes", "bound")

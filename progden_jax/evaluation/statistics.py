@@ -1,13 +1,14 @@
 """Means over scenes, and how sure they are."""
 
 import math
-from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from collections.abc import Collection, Iterable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import stdtrit
 
 from progden_jax.evaluation.database import Row
+from progden_jax.evaluation.settings import names, parse
 
 CONFIDENCE = 0.95
 
@@ -34,6 +35,14 @@ class Interval(NamedTuple):
 
 Table = dict[str, dict[int, Interval]]
 """Method -> samples per pixel -> interval."""
+
+
+class Worst(NamedTuple):
+    """The largest ratio, and the render that has it."""
+
+    ratio: float
+    scene: str
+    spp: int
 
 
 def interval(values: Sequence[float], confidence: float = CONFIDENCE) -> Interval:
@@ -99,6 +108,68 @@ def relative_to(
         }
         for method, by_spp in means(logarithms, metric, confidence).items()
     }
+
+
+def worst(rows: Sequence[Row], metric: str, over: Collection[str]) -> dict[str, Worst]:
+    """The largest ratio of a method's value to the least of those of `over` on the same render.
+
+    Above 1 the method is somewhere worse than each of them, whatever the means say. Renders where the values
+    are not all there and above 0 are left out, and methods without any.
+    """
+    least: dict[tuple[str, int], list[float]] = {}
+    for row in rows:
+        if row.method in over:
+            least.setdefault((row.scene, row.spp), []).append(getattr(row, metric) or 0.0)
+    found: dict[str, Worst] = {}
+    for row in rows:
+        value, others = getattr(row, metric), least.get((row.scene, row.spp), [])
+        if value is None or len(others) < len(over) or min(others) <= 0:
+            continue
+        here = Worst(value / min(others), row.scene, row.spp)
+        found[row.method] = max(found.get(row.method, here), here)
+    return found
+
+
+def shares(table: Table, baseline: str, best: str, spps: Collection[int]) -> dict[str, float]:
+    """Method -> its share of the gain of `best` over the baseline, in the mean over these samples per pixel.
+
+    0 is the baseline, 1 the best; a method may be beyond either. Empty where `best` gains nothing.
+
+    Raises
+    ------
+    ValueError
+        If the table lacks the baseline, `best`, or one of the samples per pixel of them.
+    """
+    for name in (baseline, best):
+        if lacking := [spp for spp in spps if spp not in table.get(name, {})]:
+            raise ValueError(f"{name!r} has no results at {', '.join(map(str, lacking))} spp.")
+    values = {
+        method: float(np.mean([by_spp[spp].mean for spp in spps]))
+        for method, by_spp in table.items()
+        if by_spp.keys() >= set(spps)
+    }
+    gain = values[baseline] - values[best]
+    return {m: (values[baseline] - v) / gain for m, v in values.items()} if gain else {}
+
+
+def split(rows: Iterable[Row], setting: str) -> dict[Any, list[Row]]:
+    """Rows by the value of a setting, with those that have none, such as the render, in every group.
+
+    Labels that were made of the settings lose this one, so that methods are called alike in all groups.
+    """
+    rows = list(rows)
+    values = dict.fromkeys(row.settings[setting] for row in rows if setting in row.settings)
+    relabelled = [row._replace(method=_label(row, setting)) for row in rows]
+    return {
+        value: [row for row in relabelled if row.settings.get(setting, value) == value]
+        for value in values
+    }
+
+
+def _label(row: Row, without: str) -> str:
+    known = names()
+    settings = parse({n: v for n, v in row.settings.items() if n in known}, source=row.method)
+    return settings.label([without]) if settings.label() == row.method else row.method
 
 
 def sure_bias(rows: Iterable[Row], confidence: float = CONFIDENCE) -> Table:

@@ -1,5 +1,6 @@
 """From a run's folder to the page's folder, whole or not at all."""
 
+import functools
 import json
 import math
 import os
@@ -15,6 +16,7 @@ import numpy as np
 from progden_jax import _files, metrics, sheet
 from progden_jax.evaluation.database import Row, rows
 from progden_jax.exr import read_exr_with_info, read_layers
+from progden_jax.frame import centre
 from progden_jax.report.contents import Pictures, document, newest
 from progden_jax.report.images import ImageFiles
 
@@ -142,9 +144,9 @@ class _Gathered:
 
     def add(self, chosen: Sequence[Row]) -> None:
         """Write the pictures of all rows, those of one reference together so that it is read once."""
-        groups: dict[tuple[str, str | None], list[Row]] = {}
+        groups: dict[tuple[str, str | None, int | None], list[Row]] = {}
         for row in chosen:
-            groups.setdefault((row.scene, row.reference), []).append(row)
+            groups.setdefault((row.scene, row.reference, row.crop), []).append(row)
         self._progress(0, self._total)
         pool = ThreadPoolExecutor(len(os.sched_getaffinity(0)))
         try:
@@ -154,7 +156,8 @@ class _Gathered:
         self.warnings.sort()
 
     def _add_group(self, group: Sequence[Row]) -> None:
-        reference = self._read(group[0].reference, _color)
+        shown = functools.partial(_color, crop=group[0].crop)
+        reference = self._read(group[0].reference, shown)
         name = None if reference is None else self._files.add(reference)
         if reference is not None:
             self._expose(group[0].scene, reference)
@@ -187,7 +190,8 @@ class _Gathered:
             if layers and "" not in layers:
                 self._warn(f"{row.image} has no channels R, G, B")
             return layers if "" in layers else {}
-        color = self._read(row.render, _color) if row.method == "render" else None
+        shown = functools.partial(_color, crop=row.crop)
+        color = self._read(row.render, shown) if row.method == "render" else None
         return {} if color is None else {"": color}
 
     def _flip(self, image: Any, reference: Any, row: Row) -> str | None:
@@ -229,9 +233,9 @@ class _Gathered:
                 self.warnings.append(text)
 
 
-def _color(path: str) -> np.ndarray:
+def _color(path: str, crop: int | None) -> np.ndarray:
     frame, _ = read_exr_with_info(path, channels="variance=none", auxiliary=False)
-    return np.asarray(frame.color)
+    return np.asarray((centre(frame, crop) if crop else frame).color)
 
 
 def _size(image: np.ndarray) -> str:

@@ -1,0 +1,25 @@
+"""What mixing gains over OIDN, beside the closed form and what an oracle could gain (paper, Table 3).
+
+progden sweep experiments/table3/sweep.yaml -o runs/table3
+python -m experiments.table3.plot runs/table3
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from experiments import _plots
+from progden_jax.evaluation import Row
+
+
+def draw(rows: Sequence[Row], output: Path) -> str:
+    """Tables alone."""
+    groups = _plots.by_denoiser(rows).items()
+    return "\n\n".join(f"## {denoiser}\n\n{_plots.summary(own)}" for denoiser, own in groups)
+
+
+def main() -> None:
+    _plots.command(__doc__, Path(__file__).parent, draw)
+
+
+if __name__ == "__main__":
+    main()
