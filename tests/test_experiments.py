@@ -1,6 +1,8 @@
-"""Every experiment's command runs to its end on the bundled series."""
+"""Every sweep is a plan, every plot can be made of its results, and every other command runs to its end."""
 
 import csv
+import itertools
+import math
 import shutil
 import sys
 from collections.abc import Callable
@@ -8,31 +10,39 @@ from pathlib import Path
 from types import ModuleType
 
 import jax
+import numpy as np
 import pytest
 from conftest import DEMO
 
 import progden_jax as pd
-from experiments import _common, _mixes
+from experiments import _common, _plots, _training
 from experiments.divergence import methods
-from experiments.fig2 import run as fig2
-from experiments.fig10 import run as fig10
-from experiments.fig12 import run as fig12
-from experiments.fig14 import run as fig14
-from experiments.main_job import run as main_job
-from experiments.mc_vs_exact import run as mc_vs_exact
+from experiments.fig2 import plot as fig2
+from experiments.fig10 import plot as fig10
+from experiments.fig12 import plot as fig12
+from experiments.fig14 import plot as fig14
+from experiments.main_job import plot as main_job
+from experiments.mc_vs_exact import plot as mc_vs_exact
 from experiments.mc_vs_exact import train as mc_vs_exact_train
 from experiments.performance import run as performance
 from experiments.performance import step
 from experiments.stability import run as stability
-from experiments.table1 import run as table1
-from experiments.table2 import run as table2
-from experiments.table3 import run as table3
-from experiments.table4 import run as table4
+from experiments.table1 import plot as table1
+from experiments.table2 import plot as table2
+from experiments.table3 import plot as table3
+from experiments.table4 import plot as table4
 from experiments.table4 import train as table4_train
-from progden_jax import denoisers, mixers
+from progden_jax import denoisers, evaluation, mixers
+from progden_jax.evaluation.database import Database
+from progden_jax.evaluation.settings import DEFAULT
+from progden_jax.frame import centre
+from progden_jax.training.evaluation import Scores
+
+EXPERIMENTS = Path(_common.__file__).parent
+CONFIGS = sorted(EXPERIMENTS.glob("*/*.yaml"))
+SCENES = ("quiet", "wild")
 
 Command = Callable[..., str]
-TWO = ("--spp", 8, 32)
 
 
 @pytest.fixture
@@ -62,7 +72,7 @@ def renders(tmp_path_factory) -> Path:
     """The middle 48×48 pixels of the bundled series: running takes as long as compiling on the whole."""
     folder = tmp_path_factory.mktemp("renders")
     for path in DEMO.glob("*.exr"):
-        pd.write_exr(folder / path.name, _common.centre(pd.read_exr(path), 48))
+        pd.write_exr(folder / path.name, centre(pd.read_exr(path), 48))
     return folder
 
 
@@ -80,17 +90,245 @@ def two_scenes(renders: Path, folder: Path) -> Path:
     return folder
 
 
-def test_main_job(command, monkeypatch, renders, tiny):
-    monkeypatch.setattr(main_job, "DENOISERS", {"one": str(tiny), "other": str(tiny)})
-    printed = command(main_job, "--data", renders, "--scenes", 1)
-    rows = [line.split("|")[1:-1] for line in printed.splitlines() if "| mix |" in line]
-    assert [row[0].strip() for row in rows] == ["8", "32", "128"] * 2
-    assert all(0 < float(cell) < 1 for row in rows for cell in row[2:])
+@pytest.fixture(scope="session")
+def noisy(tmp_path_factory) -> Path:
+    """Renders of 16×16 pixels whose variance has one outlier, which is larger in the second scene."""
+    folder, rng = tmp_path_factory.mktemp("noisy"), np.random.default_rng(0)
+    for number, scene in enumerate(SCENES):
+        for spp in (*_common.SPP, _common.REFERENCE_SPP):
+            color, variance = rng.random((2, 16, 16, 3), np.float32)
+            variance[3, 5] = 100 * (number + 1)
+            pd.write_exr(folder / f"{scene}_{spp:06}spp.exr", pd.Frame(color, variance / spp))
+    return folder
 
 
-def test_main_job_without_data(command, tmp_path):
-    with pytest.raises(SystemExit, match="give --data FOLDER"):
-        command(main_job, "--data", tmp_path)
+def results(config: Path, renders: Path, run: Path) -> Path:
+    """A run as if the configuration had been carried out, with made-up results.
+
+    Errors fall as 1/√spp; the render's is 2, the denoiser's 1, the oracle's 0.5, the first mix's 0.6 and 0.01
+    more for each further one. SURE is 1.5 of its truth, the risk 1.1.
+    """
+    plan = evaluation.load(config, data={"data": [str(renders)]})
+    usual = {"render": 2.0, "denoised": 1.0, "oracle": 0.5}
+    mixes = [label for label, settings in plan.methods if settings.image == "mix"]
+    rows = []
+    with Database(run) as database:
+        for number, (item, (label, settings)) in enumerate(
+            itertools.product(plan.items, plan.methods)
+        ):
+            error = usual.get(settings.image) or 0.6 + 0.01 * mixes.index(label)
+            error /= math.sqrt(item.spp)
+            image = None
+            if item.spp in plan.data.keep_images:
+                image, flat = f"images/{number}.exr", np.full((16, 16, 3), error, np.float32)
+                (run / "images").mkdir(exist_ok=True)
+                pd.write_exr(run / image, flat, layers={"alpha": flat / 2, "denoised": flat})
+            row = evaluation.Row(
+                **dict.fromkeys(("rmse", "smape", "relmse", "flip", "ssim", "alpha"), error),
+                mse=error**2,
+                risk=None if settings.image == "oracle" else 1.1 * error**2,
+                denoised_mse=1.0,
+                sure=1.5,
+                sure_error=0.25,
+                seconds=None,
+                scene=item.scene,
+                spp=item.spp,
+                method=label,
+                image=image,
+                render=str(item.path),
+                reference=str(item.reference),
+                created="now",
+                settings=settings.flat(),
+                crop=plan.data.crop or None,
+                key=f"{config} {number}",
+            )
+            rows.append(row)
+        database.add(rows)
+    return run
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: f"{path.parent.name}/{path.stem}")
+def test_every_sweep_is_a_plan(path):
+    """Of denoisers and mixers that there are, or that the experiment's own training writes."""
+    plan = evaluation.load(path)
+    (data,) = plan.data.data
+    assert Path(data).resolve() in (_common.VALID, DEMO)
+    trained = {
+        EXPERIMENTS.parent / "runs" / name / run / "weights.safetensors"
+        for name, runs in (
+            ("table4", table4_train.RUNS),
+            ("mc_vs_exact", mc_vs_exact_train.runs([0, 1])),
+        )
+        for run in runs
+    }
+    for _, settings in plan.methods:
+        assert settings.image == "render" or settings.denoiser in denoisers.names()
+        assert settings.mixer in (DEFAULT, *mixers.names()) or Path(settings.mixer) in trained
+    named = {Path(settings.mixer) for _, settings in plan.methods if "/" in settings.mixer}
+    if path.stem == "trained":
+        assert named == {file for file in trained if path.parent.name in file.parts}
+
+
+def test_the_oidn_tables(command, noisy, tmp_path):
+    """The first mix has 0.8 of the oracle's gain, each further one 0.02 of it less."""
+    words = (results(EXPERIMENTS / "table3" / "sweep.yaml", noisy, tmp_path), "--output", tmp_path)
+    printed = command(table3, *words)
+    ours, closed = (cells(printed, name) for name in ("mix", "closed form"))
+    # Per denoiser and metric; the second one's mix comes second.
+    assert [row[6] for row in ours] == ["80.0%"] * 3 + ["78.0%"] * 3
+    assert [row[6] for row in closed] == ["76.0%"] * 3 + ["74.0%"] * 3
+    assert cells(printed, "paper's closed form, 31×31")[0][1:6] == ["0.66"] * 5
+    assert [row[7:] for row in cells(printed, "oracle")] == [["0.500", "0.250"]] * 6
+
+
+def test_tables_of_own_denoisers(command, noisy, tmp_path):
+    """Over 32 to 512 spp: means, and the shares of the oracle's gain."""
+    for name, plot in (("table1", table1), ("table2", table2)):
+        run = results(EXPERIMENTS / name / "sweep.yaml", noisy, tmp_path / name)
+        printed = command(plot, run, "--output", tmp_path)
+        found = {row[1]: row for row in cells(printed, "") if len(row) == 8}
+        mean = np.mean([spp**-0.5 for spp in (32, 128, 512)])
+        assert float(found["pro-den"][2]) == pytest.approx(0.6 * mean, rel=1e-3)
+        assert found["pro-den"][5] == "80.0%"
+        assert found["mc-render"][5] == "-200.0%"
+        assert len(cells(printed, "mix closed-form")) == 3
+
+
+def test_table4(command, noisy, tmp_path):
+    """What is trained joins what needs no training, and each ablation is held against its whole method."""
+    run = results(EXPERIMENTS / "table4" / "sweep.yaml", noisy, tmp_path / "run")
+    printed = command(table4, run, "--output", tmp_path)
+    (change,) = cells(printed, "RMSE", "closed form, without t-bound")
+    assert change[2:] == ["+1.67%"] * 5
+    assert "best step" not in printed
+    net = mixers.build("paper", {"ratio": False})
+    mixer = mixers.NetworkMixer(jax.jit(net.init)(jax.random.key(0)), net)
+    config = tmp_path / "a" / "b" / "trained.yaml"
+    weights = tmp_path / "runs" / "table4" / "paper-ratio" / "weights.safetensors"
+    for path in (config, weights):
+        path.parent.mkdir(parents=True)
+    shutil.copy(EXPERIMENTS / "table4" / "trained.yaml", config)
+    said = {"config": '{"steps": 7}', "steps": "5", "score": "0.5", "commit": "0"}
+    mixers.save_mixer(weights, mixer, **said)
+    printed = command(table4, results(config, noisy, run), "--output", tmp_path)
+    without = "paper's network, without f_act"
+    assert cells(printed, without)[0] == [without, "5 of 7", "0.5", "0"]
+    assert cells(printed, "FLIP", without)[0][2:] == ["+5.00%"] * 5
+
+
+def test_training_of_table4(command, noisy, monkeypatch, tmp_path):
+    """Each run begins from its budget, and tells how it goes on."""
+    found = {}
+
+    def train(task, folder, report):
+        found[folder.name] = task
+        report.started(2, 6)
+        report.evaluated(4, Scores(0.5, {}), best=True)
+
+    monkeypatch.setattr(_training, "MixerTask", lambda config: config)
+    monkeypatch.setattr(_training, "train", train)
+    printed = command(table4_train, "--data", noisy, "--output", tmp_path, "--set", "seed=3")
+    assert list(found) == list(table4_train.RUNS)
+    assert "paper-swap: step 2 of 6\npaper-swap: step 4, score 0.5000 (best)" in printed
+    swap, whole = found["paper-swap"], found["multiscale"]
+    assert (swap.steps, swap.swap, swap.architecture, swap.seed) == (600, 0, "paper", 3)
+    assert (whole.steps, whole.evaluate_every, whole.architecture) == (300, 100, "multiscale")
+
+
+def test_main_job(command, noisy, tmp_path):
+    run = results(EXPERIMENTS / "main_job" / "sweep.yaml", noisy, tmp_path)
+    printed = command(main_job, run, "--output", tmp_path)
+    assert cells(printed, "8", "mix")[0][2:] == ["0.2121"] * 4
+    assert cells(printed, "8", "0.6") != []
+    quiet, wild, *_ = (cells(printed, scene, "512")[0] for scene in SCENES)
+    assert quiet[4:] == wild[4:] == ["1.5", "0.25", "yes"]
+    # Of 768 values in [0, 1] three are 100 instead, or 200, and one is 0.1 %.
+    assert 0.1 < float(quiet[2]) < float(wild[2]) < 0.3
+
+
+def test_fig2(command, noisy, tmp_path):
+    run = results(EXPERIMENTS / "fig2" / "sweep.yaml", noisy, tmp_path)
+    printed = command(fig2, run, "--output", tmp_path)
+    for image in ("render", "denoised", "mix", "mix, α held"):
+        assert [row[3] for row in cells(printed, "128", image)] == ["1.10 (1.10 to 1.10)"] * 2
+    assert cells(printed, "128", "oracle")[0][3:] == ["", ""]
+    assert len(_common.read_csv(tmp_path / "fig2.csv")) == 2 * 5 * 5 * len(SCENES)
+    for denoiser in ("oidn-hdr", "oidn-hdr-alb-nrm"):
+        assert (tmp_path / f"fig2-{denoiser}.png").stat().st_size > 10_000
+
+
+def test_fig10(command, noisy, tmp_path):
+    run = results(EXPERIMENTS / "fig10" / "sweep.yaml", noisy, tmp_path)
+    printed = command(fig10, run, "--output", tmp_path)
+    assert cells(printed, "RMSE", "render")[0][2:] == [
+        *("1.414", "0.7071", "0.3536", "0.1768", "0.08839"),
+        "0.50 0.50 0.50 0.50",
+    ]
+    rows = _common.read_csv(tmp_path / "fig10.csv")
+    assert {row["method"] for row in rows} == set(_plots.IMAGES)
+    assert len(rows) == 2 * 5 * 5 * len(SCENES)
+    assert (tmp_path / "fig10.png").stat().st_size > 10_000
+
+
+def test_fig12(command, noisy, tmp_path):
+    """The last bound of a configuration is the worst in these results."""
+    run = results(EXPERIMENTS / "fig12" / "sweep.yaml", noisy, tmp_path)
+    printed = command(fig12, run, "--output", tmp_path)
+    assert cells(printed, "not bounded")[0][6] == "80.0%"
+    assert cells(printed, "21×21, no shift")[0][6] == "56.0%"
+    assert "pictures: wild at 32 spp, RMSE without the shift over with: 1.0938" in printed
+    for name in ("fig12.png", "fig12-pictures.png"):
+        assert (tmp_path / name).stat().st_size > 10_000
+
+
+def test_fig14(command, noisy, tmp_path):
+    run = results(EXPERIMENTS / "fig14" / "sweep.yaml", noisy, tmp_path)
+    printed = command(fig14, run, "--output", tmp_path)
+    (wild,), (quiet,) = (cells(printed, scene) for scene in reversed(SCENES))
+    assert float(wild[1]) > 1.5 * float(quiet[1])
+    assert "## wild" in printed
+    assert float(cells(printed, "8", "mix")[0][5]) == pytest.approx(0.61 / 8**0.5, rel=1e-3)
+    rows = _common.read_csv(tmp_path / "fig14.csv")
+    assert {row["scene"] for row in rows} == {"wild"}
+    for name in ("fig14.png", "fig14-sheet.png"):
+        assert (tmp_path / name).stat().st_size > 10_000
+
+
+def test_mc_vs_exact(command, noisy, tmp_path):
+    """The k-th mix is 0.01 k from the first in the image, half that in α; the first two are exact."""
+    run = results(EXPERIMENTS / "mc_vs_exact" / "sweep.yaml", noisy, tmp_path / "run")
+    printed = command(mc_vs_exact, run, "--output", tmp_path)
+    (exact,), (once,) = (cells(printed, "shipped", m) for m in ("exact", "1 probe"))
+    assert exact[2:] == ["0.6000"] * 3 + ["0.000%, 0.00%"] * 2 + ["0.0%", "0.000", "4"]
+    assert once[5] == "5.833%, 8.33%"
+    assert once[7] == "5.8%"
+    rows = _common.read_csv(tmp_path / "inference.csv")
+    assert len(rows) == (2 + 2 + 2 * 8) * 2 * len(SCENES)
+    fourth = next(
+        r for r in rows if (r["mixer"], r["method"], r["seed"]) == ("shipped", "4 probes", "3")
+    )
+    assert float(fourth["alpha"]) == pytest.approx(0.5 * float(fourth["image"]) * 0.6 / 8**0.5)
+
+
+def test_training_of_mc_vs_exact(command, noisy, monkeypatch, tmp_path):
+    """Its configurations are whole, and made for crops of the renders."""
+    found = {}
+    monkeypatch.setattr(_training, "train_all", lambda runs, output: found.update(runs))
+    words = ("--data", noisy, "--output", tmp_path, "--crop", 16, "--seeds", 0)
+    command(mc_vs_exact_train, *words)
+    assert list(found) == list(mc_vs_exact_train.runs([0]))
+    exact = found["exact-seed-0"]
+    assert (exact.method, exact.crop, exact.data) == ("exact", 16, (str(tmp_path / "crops-16"),))
+    (first, *_) = sorted((tmp_path / "crops-16").iterdir())
+    assert pd.read_exr(first).size == (16, 16)
+
+
+def test_a_run_that_lacks_what_a_plot_shows_is_told(command, noisy, tmp_path):
+    with pytest.raises(SystemExit, match="nowhere holds no results.sqlite"):
+        command(table3, tmp_path / "nowhere")
+    run = results(EXPERIMENTS / "table1" / "sweep.yaml", noisy, tmp_path / "run")
+    with pytest.raises(SystemExit, match="no images were kept: .* --keep-images"):
+        command(fig14, run, "--output", tmp_path)
 
 
 def test_stability(command, monkeypatch, tmp_path):
@@ -138,125 +376,6 @@ def test_methods(command, monkeypatch, tiny, tmp_path):
     assert float(rows["probing"]["passes"]) == 5
     assert (tmp_path / "found.png").stat().st_size > 10_000
     assert command(methods, *words) in first
-
-
-def test_table3(command, renders):
-    words = ("--denoisers", "oidn-hdr-small", "--mixers", "oidn-hdr")
-    printed = command(table3, "--data", renders, *TWO, *words)
-    rows, oracle = cells(printed, "mix by oidn-hdr"), cells(printed, "oracle")
-    assert len(rows) == len(oracle) == 3
-    assert all(float(row[2]) < 1 for row in rows)
-    assert all(float(row[i]) < 1 for row in oracle for i in (1, 2))
-
-
-def test_tables_1_and_2(command, renders, tiny):
-    """A denoiser that is not there is skipped by name; one without a mixer gets the closed form."""
-    words = ("--denoisers", "unet-nowhere", tiny)
-    printed = command(table1, "--data", renders, *TWO, *words)
-    assert "skipped unet-nowhere: neither a file nor one of oidn-hdr" in printed
-    (den,) = cells(printed, f"{tiny} (ClosedForm(window=15, confidence=0.7))", "den")
-    mix, closed, oracle = (cells(printed, "", m)[0] for m in ("pro-den", "closed form", "oracle"))
-    assert mix == ["", "pro-den", *closed[2:]]
-    assert float(oracle[2]) < float(mix[2]) < float(den[2])
-    assert den[5] == "0.0%"
-    assert oracle[5] == "100.0%"
-    with pytest.raises(SystemExit, match="no denoiser to measure"):
-        command(table2, "--data", renders, *TWO, "--denoisers", "nowhere.safetensors")
-
-
-def test_table4(command, renders, tiny, tmp_path):
-    """An ablation trained for one step stands beside the whole method; what is missing is named."""
-    data, runs = two_scenes(renders, tmp_path), tmp_path / "runs"
-    few = ("steps=1", "batch=2", "crop=16", "spp=[8]", f"denoiser={tiny}", "exposure_stops=0.0")
-    words = ("--data", data, "--output", runs, "--set", *few, "--only", "paper-ratio")
-    assert "paper-ratio: step 1, score" in command(table4_train, *words)
-    whole = mixers.build("paper")
-    mixer = mixers.NetworkMixer(jax.jit(whole.init)(jax.random.key(0)), whole)
-    (runs / "paper").mkdir()
-    said = {"config": '{"steps": 7}', "steps": "7", "score": "1", "commit": "0"}
-    mixers.save_mixer(runs / "paper" / "weights.safetensors", mixer, **said)
-    words = ("--data", renders, "--spp", 32, "--denoiser", tiny, "--runs", runs)
-    printed = command(table4, *words)
-    assert "no weights of paper-sure, paper-swap, multiscale" in printed
-    assert cells(printed, "paper, without f_act")[0][1] == "1 of 1"
-    (change,) = cells(printed, "RMSE", "paper, without f_act")
-    assert float(change[2].rstrip("%")) != 0
-    assert len(cells(printed, "closed form, without t-bound")) == len(_mixes.METRICS)
-
-
-def test_fig2(command, tiny, tmp_path):
-    """The render's error is its variance, and SURE's estimate of the denoised image's is near."""
-    output = tmp_path / "found.csv"
-    words = ("--denoisers", tiny, "--probes", 1, "--output", output)
-    command(fig2, "--data", DEMO, "--spp", 128, *words)
-    rows = {row["image"]: row for row in _common.read_csv(output)}
-    assert set(rows) == {"render", "denoised", "mix", "mix, α held", "oracle"}
-    for name, tolerance in (("render", 0.2), ("denoised", 0.5), ("mix", 0.5)):
-        truth, estimate = (float(rows[name][column]) for column in ("mse", "estimate"))
-        assert abs(estimate / truth - 1) < tolerance
-    assert float(rows["mix"]["mse"]) < float(rows["denoised"]["mse"])
-    assert (tmp_path / "found-tiny.png").stat().st_size > 10_000
-
-
-def test_fig10(command, renders, tiny, tmp_path):
-    output = tmp_path / "found.csv"
-    words = ("--denoisers", tiny, "--output", output)
-    printed = command(fig10, "--data", renders, *TWO, *words)
-    (render,) = cells(printed, "RMSE", "render")
-    assert float(render[3]) < float(render[2])
-    assert len(_common.read_csv(output)) == 10
-    assert output.with_suffix(".png").stat().st_size > 10_000
-
-
-def test_fig12(command, renders, tiny, tmp_path, monkeypatch):
-    """Every window, with and without shift, gives another image."""
-    monkeypatch.setattr(fig12, "WINDOWS", (3, 11))
-    bounds = [
-        fig12.Bound(window=window, shift=shift) for shift in (True, False) for window in (3, 11)
-    ]
-    monkeypatch.setattr(fig12, "BOUNDS", bounds)
-    output = tmp_path / "found.csv"
-    words = ("--denoiser", tiny, "--mixer", "closed-form", "--output", output)
-    printed = command(fig12, "--data", renders, "--spp", 32, *words)
-    assert len(cells(printed, "11×11, no shift")) == 3
-    found = {row["image"]: row["RMSE"] for row in _common.read_csv(output)}
-    assert len({found[name] for name in ("not bounded", *map(fig12.name, bounds))}) == 5
-    for name in ("found.png", "found-pictures.png"):
-        assert (tmp_path / name).stat().st_size > 10_000
-
-
-def test_fig14(command, renders, tiny, tmp_path):
-    output = tmp_path / "found.csv"
-    words = ("--denoiser", tiny, "--output", output)
-    printed = command(fig14, "--data", renders, *TWO, *words)
-    assert cells(printed, "proc2004") != []
-    assert 0 < float(cells(printed, "8", "mix")[0][5]) < 1
-    assert {row["spp"] for row in _common.read_csv(output)} == {"8", "32"}
-    for name in ("found.png", "found-sheet.png"):
-        assert (tmp_path / name).stat().st_size > 10_000
-
-
-def test_mc_vs_exact(command, renders, tiny, tmp_path, monkeypatch):
-    """On crops of 16 pixels: probes change the image a little, and a second run has nothing to do."""
-    output, runs = tmp_path / "found.csv", tmp_path / "runs"
-    data = two_scenes(renders, tmp_path)
-    monkeypatch.setenv("PROGDEN_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(mc_vs_exact_train, "METHODS", {"exact": mc_vs_exact_train.METHODS["exact"]})
-    compared = {name: (mc_vs_exact.INFERENCE[name][0], 1) for name in ("exact", "1 probe")}
-    monkeypatch.setattr(mc_vs_exact, "INFERENCE", compared)
-    few = ("steps=1", "batch=2", "spp=[8]", f"denoiser={tiny}", "exposure_stops=0.0")
-    words = ("--data", data, "--output", runs, "--crop", 16, "--seeds", 0)
-    command(mc_vs_exact_train, *words, "--set", *few, "options={ width = 4, blocks = 1 }")
-    words = ("--data", data, "--runs", runs, "--crop", 16, "--scenes", 1, "--spp", 8)
-    words += ("--denoiser", tiny)
-    printed = command(mc_vs_exact, *words, "--output", output)
-    rows = _common.read_csv(output)
-    assert [row["mixer"] for row in rows] == ["denoised", "oracle", "exact-seed-0", "exact-seed-0"]
-    for row in rows:
-        assert (float(row["image"]) > 0) == (row["method"] != "exact")
-    assert cells(printed, "exact", "1 probe") != []
-    assert command(mc_vs_exact, *words, "--output", output) == printed
-    assert _common.read_csv(output) == rows
 
 
 def test_step(command, renders, tmp_path):
