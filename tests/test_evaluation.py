@@ -16,6 +16,8 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+import report_run
+import toy_denoisers
 from code_generation import users_environment
 from conftest import counting_compilations
 from evaluation_runs import REFERENCE, TOY, Remembers, write_series
@@ -23,10 +25,18 @@ from evaluation_runs import REFERENCE, TOY, Remembers, write_series
 import progden_jax as pd
 from progden_jax import evaluation, metrics
 from progden_jax.cli import main
+from progden_jax.denoisers import FunctionDenoiser
 from progden_jax.evaluation import exports, statistics
 from progden_jax.evaluation.database import Database, Row
 from progden_jax.evaluation.parts import load_denoiser
 from progden_jax.evaluation.plan import PRESETS
+from progden_jax.evaluation.risk import risk_of_held, risk_of_mix
+from progden_jax.evaluation.settings import parse
+from progden_jax.exr import read_layers
+from progden_jax.frame import centre
+from progden_jax.memory import Peak
+from progden_jax.report.build import build_report
+from progden_jax.training.losses import mix_risk
 
 METHODS = [name for name in PRESETS if name != "paper"]
 
@@ -88,7 +98,17 @@ def test_rows_are_of_what_the_pipeline_gives(run, renders):
         assert row.mse == pytest.approx(float(error - np.mean(reference.variance)), rel=1e-4)
         kept = pd.read_exr(folder / row.image)
         np.testing.assert_allclose(kept.color, image, rtol=1e-5)
+    frame_risk = np.mean(np.asarray(frame.variance), dtype=np.float64)
+    assert row_of(rows, "render").risk == pytest.approx(float(frame_risk), rel=1e-5)
+    row = row_of(rows, f"denoised {label}")
+    assert row.risk == row.sure
+    pixels = np.asarray(result.sure).mean(-1)
+    assert row.sure_error == pytest.approx(float(pixels.std() / 16), rel=1e-3)
     row = row_of(rows, f"mix {label}")
+    held = mix_risk(*(np.asarray(a) for a in known_of(result, frame)))
+    assert row.risk == pytest.approx(float(np.mean(held)), rel=1e-3)
+    assert row.alpha == pytest.approx(float(result.mean_alpha), rel=1e-4)
+    assert row_of(rows, "render").alpha is None
     assert row.sure == pytest.approx(float(np.mean(result.sure)), rel=1e-3)
     assert row.denoised_mse == row_of(rows, f"denoised {label}").mse
     assert row_of(rows, "render").sure is None
@@ -98,8 +118,14 @@ def test_rows_are_of_what_the_pipeline_gives(run, renders):
     info = {c.split(".")[0] for c in channels(folder / row.image)}
     assert info == {"R", "G", "B", "alpha", "sure", "denoised"}
     assert any(r.seconds is not None for r in rows)
+    assert all((r.seconds is None) == (r.memory is None) for r in rows)
     oracle, mixed = (row_of(rows, f"{m} {label}").rmse for m in ("oracle", "mix"))
     assert oracle < mixed
+
+
+def known_of(result, frame):
+    """What the risk of the mix takes."""
+    return result.alpha, frame.color, result.denoised, frame.variance, result.divergence
 
 
 def channels(path):
@@ -169,8 +195,89 @@ def test_a_run_has_one_writer_and_no_foreign_files(tmp_path):
         evaluation.rows(other)
     with closing(sqlite3.connect(run / "results.sqlite")) as connection:
         connection.execute("PRAGMA user_version = 9")
-    with pytest.raises(ValueError, match="user_version is 9, expected 1"):
+    with pytest.raises(ValueError, match="user_version is 9, expected 2"):
         Database(run)
+
+
+def test_results_of_the_first_version_are_read_and_added_to(tmp_path):
+    with closing(sqlite3.connect(tmp_path / "results.sqlite")) as connection:
+        connection.executescript(report_run.SCHEMA)
+        connection.execute(
+            "INSERT INTO results(key, scene, spp, method, settings, rmse, created)"
+            " VALUES('old', 'a', 4, 'mix', '{}', 0.5, 'then')"
+        )
+        connection.commit()
+    (before,) = evaluation.rows(tmp_path)
+    assert (before.rmse, before.risk, before.crop) == (0.5, None, None)
+    with Database(tmp_path) as database:
+        assert database.known() == {"old"}
+        database.add([made("mix", "b", risk=2.0, crop=8)])
+    after = evaluation.rows(tmp_path)
+    assert after[0] == before
+    assert (after[1].risk, after[1].crop, after[1].memory) == (2.0, 8, None)
+    Database(tmp_path).close()
+
+
+def test_crops_kept_images_and_the_risk_of_the_whole_chain(renders, tmp_path):
+    """Of a denoiser that halves the colour, whose divergence one probe has exactly."""
+    config = tmp_path / "own.yaml"
+    config.write_text(
+        f"data: [{renders}]\nscenes: [scene1]\ncrop: 8\nkeep_images: [4]\n"
+        f"base: {{denoiser: '{TOY.replace('blur', 'dim')}', bound: false}}\n"
+        "list: [render, {image: mix, label: held}, {image: mix, label: whole, risk_probes: 1}]\n"
+    )
+    report = Remembers()
+    assert evaluation.carry_out(evaluation.load(config), tmp_path / "run", report=report) == (
+        6,
+        0,
+        0,
+    )
+    rows = evaluation.rows(tmp_path / "run")
+    assert [(r.spp, r.image is not None) for r in rows] == [(4, True)] * 3 + [(16, False)] * 3
+    assert {row.crop for row in rows} == {8}
+    frame, truth = (
+        centre(pd.read_exr(renders / f"scene1_{spp:06}spp.exr"), 8) for spp in (4, REFERENCE)
+    )
+    render, held, whole = rows[:3]
+    assert render.rmse == pytest.approx(float(metrics.rmse(frame.color, truth.color)), rel=1e-4)
+    kept = read_layers(tmp_path / "run" / whole.image)
+    assert kept[""].shape == (8, 8, 3)
+    assert (held.rmse, held.alpha, held.sure) == (whole.rmse, whole.alpha, whole.sure)
+    # α follows the noise, so that held constant it looks better than it is.
+    assert held.risk < whole.risk
+    built = build_report(tmp_path / "run", tmp_path / "site")
+    assert built.warnings == ()
+    again = evaluation.carry_out(evaluation.load(config), tmp_path / "run", report=report)
+    assert again == (0, 6, 0)
+    report = Remembers()
+    config.write_text(config.read_text().replace("crop: 8", "crop: 32"))
+    assert (
+        evaluation.carry_out(evaluation.load(config), tmp_path / "two", report=report).failed == 6
+    )
+    assert "the crop is 32 pixels wide, the frame 16×16" in report.failures[0]
+
+
+@jax.tree_util.register_static
+class Quarter:
+    """A mixer whose α is a quarter of the render."""
+
+    receptive_radius = 0
+
+    def __call__(self, x, *_, **__):
+        return x / 4
+
+
+def test_risk_of_a_mix_against_its_formula():
+    """z = x − x²/8 has the derivative 1 − x/4; with α held constant it is taken as 1 − x/8."""
+    rng = np.random.default_rng(2)
+    x, variance = rng.random((2, 8, 8, 3), np.float32)
+    frame, denoiser = pd.Frame(x, variance), FunctionDenoiser(toy_denoisers.dim)
+    settings = {"method": pd.MonteCarlo(probes=1), "probes": 1, "seed": 3}
+    found = risk_of_mix(frame, denoiser, Quarter(), None, **settings)
+    change = (x**2 / 8) ** 2 - variance
+    assert found == pytest.approx(float(np.mean(change + 2 * variance * (1 - x / 4))), rel=1e-5)
+    held = float(risk_of_held(x / 4, x, x / 2, variance, variance / 2))
+    assert held == pytest.approx(float(np.mean(change + 2 * variance * (1 - x / 8))), rel=1e-5)
 
 
 def test_a_label_means_one_thing_in_a_run(renders, tmp_path):
@@ -222,6 +329,42 @@ def test_means_ratios_and_the_bias_of_sure():
         statistics.relative_to(rows, "c", "rmse")
     bias = statistics.sure_bias(rows)["a"][8]
     assert bias.mean == pytest.approx(0.1 / 5.5)
+
+
+def test_the_worst_render_and_shares_of_a_gain():
+    errors = {"a": (2.0, 4.0), "b": (3.0, 1.0), "mix": (1.0, 3.0), "best": (0.5, 0.5)}
+    rows = [
+        made(m, s, spp, rmse=v * spp)
+        for m, vs in errors.items()
+        for s, v in zip("xy", vs, strict=True)
+        for spp in (1, 2)
+    ]
+    worst = statistics.worst(rows, "rmse", ["a", "b"])
+    assert worst["mix"] == (3.0, "y", 2)
+    assert worst["a"].ratio == 4.0
+    assert worst["best"] == (0.5, "y", 2)
+    rows += [made("late", "z", rmse=1.0), made("a", "z", rmse=0.0), made("b", "z", rmse=1.0)]
+    assert "late" not in statistics.worst(rows, "rmse", ["a", "b"])
+    table = statistics.means(rows, "rmse")
+    shares = statistics.shares(table, "a", "best", [1, 2])
+    assert shares == pytest.approx({"a": 0, "b": 0.4, "mix": 0.4, "best": 1})
+    assert statistics.shares(table, "a", "a", [1]) == {}
+    with pytest.raises(ValueError, match="'late' has no results at 1, 2 spp"):
+        statistics.shares(table, "a", "late", [1, 2])
+
+
+def test_rows_split_by_a_setting():
+    """Labels that people gave stay, and what has no such setting is in every group."""
+    chosen = [
+        parse(v, source="") for v in ({"image": "render"}, {"denoiser": "a"}, {"denoiser": "b"})
+    ]
+    rows = [made(s.label(), "x", settings={**s.flat(), "mixer.trained.probes": 4}) for s in chosen]
+    rows.append(rows[1]._replace(method="my own"))
+    groups = statistics.split(rows, "denoiser")
+    assert {value: [r.method for r in own] for value, own in groups.items()} == {
+        "a": ["render", "mix", "my own"],
+        "b": ["render", "mix"],
+    }
 
 
 def test_exports(tmp_path):
@@ -366,3 +509,28 @@ def clear_parts():
 
     load_denoiser.cache_clear()
     parts._denoiser_content.cache_clear()
+
+
+def test_peak_memory(monkeypatch):
+    """Of this process, where the kernel tells; of a device only if it has not held as much before."""
+    taken = Peak()
+    (np.ones(2**23) * 2).sum()
+    told = taken.read()
+    assert told is None or 2**26 <= told < 2**28
+
+    class Device:
+        told = ({"bytes_in_use": 10, "peak_bytes_in_use": 50},) * 2 + (
+            {"bytes_in_use": 10, "peak_bytes_in_use": 70},
+        )
+
+        def __init__(self):
+            self._left = list(self.told)
+
+        def memory_stats(self):
+            return self._left.pop(0)
+
+    device = Device()
+    monkeypatch.setattr(jax, "devices", lambda: [device])
+    taken = Peak()
+    assert taken.read() is None
+    assert taken.read() == 60

@@ -77,6 +77,8 @@ def test_a_grid_is_every_combination_and_a_list_single_methods(config):
         ("grid: {image: [picture]}", "image is 'picture', expected one of 'mix', 'denoised'"),
         ("grid: {bound.sigmoid: [tanh]}", "sigmoid is 'tanh', expected one of 'normal'"),
         ("base: {estimator: none}", "mixing needs SURE"),
+        ("base: {risk_probes: -1}", "risk_probes is -1, expected a whole number from 0 up"),
+        ("crop: -1", "crop is -1, expected a side in pixels"),
         ("base: 3", "base is 3, expected settings"),
         ("list: [mixed]", "list, entry 1 is 'mixed', expected settings or one of render"),
         ("list: [{image: render, label: 3}]", "label is 3, expected text"),
