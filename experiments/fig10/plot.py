@@ -29,7 +29,10 @@ def slopes(rows: Sequence[Row]) -> str:
 
 def draw(rows: Sequence[Row], output: Path) -> str:
     """A row of plots per denoiser, a column per metric."""
-    groups = _plots.by_denoiser(rows)
+    groups = {
+        denoiser: [row for row in own if row.method in _plots.IMAGES]
+        for denoiser, own in _plots.by_denoiser(rows).items()
+    }
     _plots.write_rows(output / "fig10.csv", groups)
     figure = Figure(figsize=(12, 3.7 * len(groups)), layout="constrained")
     axes = figure.subplots(len(groups), len(_plots.METRICS), squeeze=False)

@@ -15,8 +15,9 @@ if TYPE_CHECKING:
 HELP = """Evaluate every combination of settings that CONFIG spans; results go to OUTPUT/results.sqlite.
 
 CONFIG is YAML or TOML. `base` holds settings that all methods share, `grid` lists values whose every
-combination is a method, `list` single methods; `data`, `spp` and `scenes` name the renders. Paths in it are
-relative to it. What is there already is not computed again.
+combination is a method, `list` single methods; `data`, `spp` and `scenes` name the renders, `crop` takes their
+centre, `keep_images` names samples per pixel whose pictures are kept. Paths in it are relative to it. What is
+there already is not computed again.
 
 ```yaml
 data: [renders]
@@ -30,7 +31,7 @@ list: [render, denoised, {mixer: runs/k4/weights.safetensors, label: trained wit
 
 Settings: image (mix, denoised, render, oracle), denoiser (a name, a file, FILE.py:FUNCTION), precision,
 estimator, probes, epsilon, seed, mixer, mixer.window and mixer.confidence (of closed-form), bound, bound.a,
-bound.c, bound.window, bound.shift, bound.sigmoid.
+bound.c, bound.window, bound.shift, bound.sigmoid, risk_probes (for SURE of the mix itself).
 
 ```
 progden sweep smoke.yaml --dry-run
