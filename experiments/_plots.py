@@ -152,14 +152,17 @@ def write_rows(
     _common.write_csv(path, ("denoiser", "scene", "spp", "method", *columns), values)
 
 
-def plot_over_spp(axis: Axes, rows: Sequence[Row], metric: str) -> None:
-    """Means over scenes of the `IMAGES` that there are, log-log."""
+def plot_over_spp(
+    axis: Axes, rows: Sequence[Row], metric: str, colors: Mapping[str, str] = IMAGES
+) -> None:
+    """Means over scenes of those of the methods that there are, log-log."""
     means = over_scenes(rows, metric)
-    for name in (name for name in IMAGES if name in means):
+    for name in (name for name in colors if name in means):
         style = ":" if name == "oracle" else "o-"
         values = list(means[name].values())
-        axis.plot(list(means[name]), values, style, color=IMAGES[name], ms=4, label=name)
-    axis.set(xscale="log", yscale="log", xlabel="samples per pixel", ylabel=METRICS[metric])
+        axis.plot(list(means[name]), values, style, color=colors[name], ms=4, label=name)
+    title = statistics.METRICS[metric]
+    axis.set(xscale="log", yscale="log", xlabel="samples per pixel", ylabel=title)
     spp_ticks(axis, (row.spp for row in rows))
     axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axis.yaxis.set_major_formatter("{x:g}")

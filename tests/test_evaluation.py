@@ -353,6 +353,11 @@ def test_the_worst_render_and_shares_of_a_gain():
         statistics.shares(table, "a", "late", [1, 2])
 
 
+def test_typical_costs():
+    rows = [made("a", s, seconds=v) for s, v in zip("wxyz", (None, 1.0, 9.0, 2.0), strict=True)]
+    assert statistics.medians([*rows, made("b", "x")], "seconds") == {"a": 2.0}
+
+
 def test_rows_split_by_a_setting():
     """Labels that people gave stay, and what has no such setting is in every group."""
     chosen = [

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 HELP = """Evaluate every combination of settings that CONFIG spans; results go to OUTPUT/results.sqlite.
 
 CONFIG is YAML or TOML. `base` holds settings that all methods share, `grid` lists values whose every
-combination is a method, `list` single methods; `data`, `spp` and `scenes` name the renders, `crop` takes their
-centre, `keep_images` names samples per pixel whose pictures are kept. Paths in it are relative to it. What is
-there already is not computed again.
+combination is a method, `list` single methods; `data`, `spp` and `scenes` name the renders, `crop` takes
+their centre, `keep_images` names samples per pixel whose pictures are kept. Paths in it are relative to it.
+What is there already is not computed again.
 
 ```yaml
 data: [renders]

@@ -172,6 +172,18 @@ def _label(row: Row, without: str) -> str:
     return settings.label([without]) if settings.label() == row.method else row.method
 
 
+def medians(rows: Iterable[Row], column: str) -> dict[str, float]:
+    """Method -> the median over renders of `seconds` or `memory`, where they are known.
+
+    Neither is for a method's first render of a size in a process, when its programs are compiled.
+    """
+    found: dict[str, list[float]] = {}
+    for row in rows:
+        if (value := getattr(row, column)) is not None:
+            found.setdefault(row.method, []).append(value)
+    return {method: float(np.median(values)) for method, values in found.items()}
+
+
 def sure_bias(rows: Iterable[Row], confidence: float = CONFIDENCE) -> Table:
     """How far SURE is from the denoised image's true MSE: the mean difference over the mean MSE.
 
