@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 from matplotlib.figure import Figure
 
 import progden_jax as pd
@@ -104,6 +105,11 @@ def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]
         writer = csv.writer(file)
         writer.writerow(header)
         writer.writerows(rows)
+
+
+def rms(values: Any) -> float:
+    """Root of the mean square."""
+    return float(np.sqrt(np.square(np.asarray(values, np.float64)).mean()))
 
 
 def write_text(path: Path, text: str) -> None:

@@ -1,12 +1,10 @@
 """What the tables and figures made of sweeps share: the rows of a run, what is said of them, curves."""
 
 import argparse
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator
 
@@ -48,6 +46,9 @@ def command(
             raise ValueError("there are no results yet: let its sweep finish a scene first.")
         arguments.output.mkdir(parents=True, exist_ok=True)
         text = draw([_opened(row, arguments.run) for row in found], arguments.output)
+    except KeyError as error:
+        lacking = f"there are no results of {error}, which this shows: carry out its own sweep"
+        raise SystemExit(f"{arguments.run}: {lacking}.") from None
     except ValueError as error:
         raise SystemExit(f"{arguments.run}: {error}") from None
     print(f"{len({row.scene for row in found})} scenes, {len(found)} rows of {arguments.run}\n")
@@ -76,6 +77,20 @@ def kept(rows: Iterable[Row]) -> list[Row]:
 def by_denoiser(rows: Sequence[Row]) -> dict[str, list[Row]]:
     """Denoiser -> its rows and the render's, the methods called alike for each."""
     return statistics.split(rows, "denoiser")
+
+
+def of_one_denoiser(rows: Sequence[Row]) -> tuple[str, list[Row]]:
+    """The denoiser and its rows, as `by_denoiser` has them.
+
+    Raises
+    ------
+    ValueError
+        If there are several.
+    """
+    found = by_denoiser(rows)
+    if len(found) != 1:
+        raise ValueError(f"this shows one denoiser, and the run has {', '.join(found) or 'none'}.")
+    return next(iter(found.items()))
 
 
 def renamed(rows: Iterable[Row], name: Callable[[Mapping[str, Any]], str]) -> list[Row]:
@@ -174,8 +189,3 @@ def spp_ticks(axis: Axes, spps: Iterable[int]) -> None:
     found = sorted(set(spps))
     axis.set_xticks(found, labels=[str(spp) for spp in found])
     axis.minorticks_off()
-
-
-def rms(values: np.ndarray) -> float:
-    """Root of the mean square."""
-    return math.sqrt(np.square(np.asarray(values, np.float64)).mean())

@@ -329,6 +329,11 @@ def test_a_run_that_lacks_what_a_plot_shows_is_told(command, noisy, tmp_path):
     run = results(EXPERIMENTS / "table1" / "sweep.yaml", noisy, tmp_path / "run")
     with pytest.raises(SystemExit, match="no images were kept: .* --keep-images"):
         command(fig14, run, "--output", tmp_path)
+    with pytest.raises(SystemExit, match="no results of 'not bounded', which this shows"):
+        command(fig12, run, "--output", tmp_path)
+    run = results(EXPERIMENTS / "fig10" / "sweep.yaml", noisy, tmp_path / "two")
+    with pytest.raises(SystemExit, match="one denoiser, and the run has oidn-hdr, oidn-hdr-alb"):
+        command(fig14, run, "--output", tmp_path)
 
 
 def test_stability(command, monkeypatch, tmp_path):

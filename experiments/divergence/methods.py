@@ -76,10 +76,6 @@ def consequences(frame: pd.Frame, reference: jax.Array, y: jax.Array, divergence
     }
 
 
-def rms(value: Any) -> float:
-    return float(np.sqrt(np.square(np.asarray(value, np.float64)).mean()))
-
-
 class Frame(NamedTuple):
     """One frame as every method gets it, and where it came from."""
 
@@ -126,17 +122,17 @@ def measure(
         seen = consequences(frame, case.reference, found.value, found.divergence)
         yield (
             *(name, count, passes(name, count, f, x), seconds),
-            rms(estimate - truth) / rms(truth),
+            _common.rms(estimate - truth) / _common.rms(truth),
             abs(estimate.mean() - truth.mean()) / abs(truth.mean()),
-            rms(seen["sure"] - right["sure"]),
-            rms(right["sure"] - right["truth"]),
-            rms(seen["sure_window"] - right["sure_window"]),
-            rms(right["sure_window"] - right["truth_window"]),
-            rms(seen["alpha"] - right["alpha"]),
-            rms(right["alpha"] - right["oracle"]),
+            _common.rms(seen["sure"] - right["sure"]),
+            _common.rms(right["sure"] - right["truth"]),
+            _common.rms(seen["sure_window"] - right["sure_window"]),
+            _common.rms(right["sure_window"] - right["truth_window"]),
+            _common.rms(seen["alpha"] - right["alpha"]),
+            _common.rms(right["alpha"] - right["oracle"]),
             float(seen["rmse"] / right["rmse"]),
             float(seen["smape"] / right["smape"]),
-            rms(seen["image"] - right["image"]) / float(right["rmse"]),
+            _common.rms(seen["image"] - right["image"]) / float(right["rmse"]),
         )
 
 

@@ -92,7 +92,7 @@ def pictures(rows: Sequence[Row], path: Path) -> None:
 
 def draw(rows: Sequence[Row], output: Path) -> str:
     """A plot, pictures of the render on which the shift weighs most, and tables."""
-    ((denoiser, _),) = _plots.by_denoiser(rows).items()
+    denoiser, _ = _plots.of_one_denoiser(rows)
     rows = _plots.renamed(rows, name)
     _plots.write_rows(output / "fig12.csv", {denoiser: rows})
     plot(rows, output / "fig12.png")

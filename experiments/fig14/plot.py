@@ -55,7 +55,7 @@ def table(rows: Sequence[Row]) -> str:
 
 def draw(rows: Sequence[Row], output: Path) -> str:
     """A sheet of pictures, a plot and tables of one scene."""
-    ((denoiser, rows),) = _plots.by_denoiser(rows).items()
+    denoiser, rows = _plots.of_one_denoiser(rows)
     shown = [row for row in _plots.kept(rows) if row.method == "mix"]
     at = min(row.spp for row in shown)
     found = {

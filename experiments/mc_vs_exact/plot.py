@@ -69,7 +69,7 @@ def compared(rows: Sequence[Row]) -> list[Compared]:
         assert exact.rmse
         for row in own:
             layers = read_layers(str(row.image))
-            image, alpha = (_plots.rms(layers[name] - right[name]) for name in ("", "alpha"))
+            image, alpha = (_common.rms(layers[name] - right[name]) for name in ("", "alpha"))
             found.append(Compared(row, exact, image / exact.rmse, alpha))
     return found
 
@@ -121,7 +121,7 @@ def write(path: Path, found: Sequence[Compared]) -> None:
 
 def draw(rows: Sequence[Row], output: Path) -> str:
     """A table, and a CSV called by which configuration this is of."""
-    ((denoiser, rows),) = _plots.by_denoiser(rows).items()
+    denoiser, rows = _plots.of_one_denoiser(rows)
     found = compared(rows)
     shipped = {"default", "closed-form"}.issuperset(
         r.settings.get("mixer", "default") for r in rows
