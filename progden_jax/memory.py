@@ -58,7 +58,10 @@ def resident() -> int:
 
 
 class Peak:
-    """The memory that is taken from now on, beyond what is held now: of JAX's device, or of this process."""
+    """The memory that is taken from now on, beyond what is held now: of JAX's device, or of this process.
+
+    The process may hold what it has freed, and take it again unseen, above all in blocks of less than 32 MiB.
+    """
 
     def __init__(self) -> None:
         trim()

@@ -354,8 +354,10 @@ def test_the_worst_render_and_shares_of_a_gain():
 
 
 def test_typical_costs():
-    rows = [made("a", s, seconds=v) for s, v in zip("wxyz", (None, 1.0, 9.0, 2.0), strict=True)]
-    assert statistics.medians([*rows, made("b", "x")], "seconds") == {"a": 2.0}
+    measured = {"w": (None, None), "x": (1.0, 7), "y": (9.0, 5), "z": (2.0, None)}
+    rows = [made("a", s, seconds=t, memory=m) for s, (t, m) in measured.items()]
+    rows += [made("b", "w"), made("c", "x", seconds=3.0)]
+    assert statistics.costs(rows) == {"a": (2.0, 7), "c": (3.0, None)}
 
 
 def test_rows_split_by_a_setting():

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import stdtrit
 
+from progden_jax.evaluation.cost import Cost
 from progden_jax.evaluation.database import Row
 from progden_jax.evaluation.settings import names, parse
 
@@ -172,16 +173,23 @@ def _label(row: Row, without: str) -> str:
     return settings.label([without]) if settings.label() == row.method else row.method
 
 
-def medians(rows: Iterable[Row], column: str) -> dict[str, float]:
-    """Method -> the median over renders of `seconds` or `memory`, where they are known.
+def costs(rows: Iterable[Row]) -> dict[str, Cost]:
+    """Method -> the median of its seconds over renders, and the most memory, where they are known.
 
-    Neither is for a method's first render of a size in a process, when its programs are compiled.
+    Neither is for a method's first render of a size in a process, when its programs are compiled. Of the memory
+    single renders tell too little: what earlier ones have freed may be at hand still.
     """
-    found: dict[str, list[float]] = {}
+    found: dict[str, list[Row]] = {}
     for row in rows:
-        if (value := getattr(row, column)) is not None:
-            found.setdefault(row.method, []).append(value)
-    return {method: float(np.median(values)) for method, values in found.items()}
+        if row.seconds is not None:
+            found.setdefault(row.method, []).append(row)
+    return {
+        method: Cost(
+            float(np.median([row.seconds for row in own if row.seconds is not None])),
+            max((row.memory for row in own if row.memory is not None), default=None),
+        )
+        for method, own in found.items()
+    }
 
 
 def sure_bias(rows: Iterable[Row], confidence: float = CONFIDENCE) -> Table:
