@@ -66,8 +66,8 @@ class Row(NamedTuple):
         image, and of a mix SURE with α held constant or, by the setting risk_probes, of the whole chain.
     sure_error : standard error of `sure`, from the spread between pixels.
     alpha : mean weight of the denoised image, after the bound; None where nothing is mixed.
-    memory : bytes that the process, or the device, grew by at most meanwhile, less than was taken where what was
-        freed before was still at hand; None where `seconds` is, and where the system does not tell.
+    memory : bytes that the process, or the device, grew by at most meanwhile, less than was taken where what
+        was freed before was at hand; None where `seconds` is, and where the system does not tell.
     crop : side in pixels of the centre square that this is of; None: the whole image.
     """
 

@@ -176,8 +176,8 @@ def _label(row: Row, without: str) -> str:
 def costs(rows: Iterable[Row]) -> dict[str, Cost]:
     """Method -> the median of its seconds over renders, and the most memory, where they are known.
 
-    Neither is for a method's first render of a size in a process, when its programs are compiled. Of the memory
-    single renders tell too little: what earlier ones have freed may be at hand still.
+    Neither is for a method's first render of a size in a process, when its programs are compiled. Of the
+    memory single renders tell too little: what earlier ones have freed may be at hand still.
     """
     found: dict[str, list[Row]] = {}
     for row in rows:
