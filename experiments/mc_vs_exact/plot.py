@@ -67,7 +67,7 @@ def compared(rows: Sequence[Row]) -> list[Compared]:
             raise ValueError(f"{mixer} has no exact divergence for {scene} at {spp} spp.")
         right = read_layers(str(exact.image))
         assert exact.rmse
-        for row in own:
+        for row in sorted(own, key=lambda row: row is not exact):
             layers = read_layers(str(row.image))
             image, alpha = (_common.rms(layers[name] - right[name]) for name in ("", "alpha"))
             found.append(Compared(row, exact, image / exact.rmse, alpha))
