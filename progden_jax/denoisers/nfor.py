@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from progden_jax import _checks
 from progden_jax._windows import box_sum
-from progden_jax.denoisers._base import Bound
+from progden_jax.denoisers._base import Bound, Bounded
 from progden_jax.denoisers._network import PRECISIONS, Valid, inside_of
 from progden_jax.denoisers._regression import BLOCK, Windows, regress
 from progden_jax.frame import Frame
@@ -180,7 +180,7 @@ def _call(denoiser: NFOR, frame: Frame) -> Array:
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class BoundNFOR:
+class BoundNFOR(Bounded):
     """y = f(x) for one frame: what `NFOR.bind` gives.
 
     The choice of bandwidths counts as constant in derivatives.
@@ -197,16 +197,6 @@ class BoundNFOR:
         _checks.image("x", x)
         _checks.same_shape("x", x, "the frame's variance", self.variance)
         return _run(self, x)
-
-    @property
-    def receptive_radius(self) -> int:
-        """How many pixels away an output pixel can depend on the input."""
-        return self.denoiser.receptive_radius
-
-    @property
-    def alignment(self) -> int:
-        """Pixels after which the way that outputs depend on inputs repeats."""
-        return self.denoiser.alignment
 
 
 @jax.jit

@@ -1,0 +1,137 @@
+"""A deep residual network that maps noisy pixels to clean ones directly."""
+
+import functools
+from collections.abc import Mapping
+from typing import Any, ClassVar, Self
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from progden_jax import _checks, transfer
+from progden_jax.denoisers._network import Params, lit
+from progden_jax.denoisers.graph import Add, Conv, Input, LeakyRelu, Node
+from progden_jax.denoisers.own import LOG_GAIN, LogNetwork, quietened
+
+_SLOPE = 0.25
+"""Of the PReLUs at first (He et al. 2015)."""
+
+
+@jax.tree_util.register_pytree_with_keys_class
+class ResidualNet(LogNetwork):
+    """Residual blocks between two convolutions, and a skip around them all: a pytree of its weights.
+
+    A block adds to its input what two 3×3 convolutions with a PReLU between make of it. It sees and gives
+    log(1 + radiance), sees log(1 + depth), and albedo and normal as they are. In training, batch
+    normalisation follows the convolutions in blocks and the one after them
+    (`progden_jax.training.normalization`); here it is part of their weights.
+
+    With n blocks it reaches 2n + 3 pixels, and its exact divergence takes some 3(2n + 4)² passes by coloring
+    and a third of that by cone.
+
+    Parameters
+    ----------
+    params : layers "conv_in", "prelu_in", for each block "block1_conv1", "block1_prelu", "block1_conv2", ...,
+        then "conv_mid" and "conv_out".
+    inputs : buffers taken besides the colour, in this order: some of "albedo", "normal", "depth" and
+        "variance". The paper's are all but the last.
+    name : for messages; by default the architecture's.
+    precision : of the convolutions; "highest" keeps float32 on GPUs, "tensorfloat32" is about 1e-3 off.
+
+    References
+    ----------
+    Wong and Wong 2019, "Deep residual learning for denoising Monte Carlo renderings".
+
+    Notes
+    -----
+    The paper takes x and y of normals in view space. A frame does not say where the camera looks, so all three
+    components are taken in whatever space they come, world space as a rule. Renders to denoise must be as
+    those that were trained on: in that, and in the unit of depth, but for what training varies
+    (``depth_stops``). PReLUs have a slope per channel, so that images may have any size; the paper's
+    13.8 million weights come out with one per channel and pixel of its 64×64 patches. "conv_in"
+    and "conv_out" have biases.
+    """
+
+    buffers: ClassVar[tuple[str, ...]] = ("albedo", "normal", "depth", "variance")
+    gains: ClassVar[Mapping[str, float]] = {"color": LOG_GAIN, "depth": LOG_GAIN}
+
+    @classmethod
+    def init(
+        cls,
+        key: jax.Array,
+        inputs: tuple[str, ...] = (),
+        *,
+        blocks: int = 16,
+        width: int = 128,
+        name: str | None = None,
+        precision: str = "highest",
+    ) -> Self:
+        """A network to train: He's random weights, zero biases, PReLUs of slope 0.25.
+
+        The last layer has a tenth of its weights and a bias that stands for radiance 0.74, because what
+        is below 0 is cut off: a channel that began there everywhere would never learn.
+
+        Parameters
+        ----------
+        key : of the random numbers.
+        inputs : see `ResidualNet`.
+        blocks, width : number of residual blocks, and their channels: 16 and 128 make 4.9 million weights.
+        """
+        _checks.positive_int("blocks", blocks)
+        _checks.positive_int("width", width)
+        nodes = _graph(blocks)
+        shapes = {node.layer: (3, width) for node in nodes if isinstance(node, Conv)}
+        shapes["conv_out"] = (3, 3)
+        params = quietened(cls.he_params(key, inputs, nodes, shapes), "conv_out", 0.05)
+        slope = jnp.full(width, _SLOPE, params["conv_in"]["bias"].dtype)
+        slopes = {node.layer: {"slope": slope} for node in nodes if isinstance(node, LeakyRelu)}
+        return cls(params | slopes, inputs, name=name, precision=precision)
+
+    @property
+    def nodes(self) -> tuple[Node, ...]:
+        return _graph(_blocks(self.params))
+
+    @property
+    def normalized(self) -> tuple[str, ...]:
+        layers = (node.layer for node in self.nodes if isinstance(node, Conv))
+        return tuple(layer for layer in layers if layer not in ("conv_in", "conv_out"))
+
+    def transferred(self, role: str, buffer: Array) -> Array:
+        match role:
+            case "albedo":
+                return lit(buffer)
+            case "normal":
+                return jnp.clip(buffer, -1, 1)
+            case _:
+                return super().transferred(role, buffer)
+
+    def decode(self, y: Array, exposure: None) -> Array:
+        del exposure
+        return transfer.log1p_normalized_inverse(jax.nn.relu(y))
+
+
+@functools.cache
+def _graph(blocks: int) -> tuple[Node, ...]:
+    nodes: list[Node] = [Input(), Conv((0,), "conv_in"), LeakyRelu(1, "prelu_in")]
+    first = last = 2
+    for number in range(1, blocks + 1):
+        nodes += [
+            Conv((last,), f"block{number}_conv1"),
+            LeakyRelu(last + 1, f"block{number}_prelu"),
+            Conv((last + 2,), f"block{number}_conv2"),
+            Add((last, last + 3)),
+        ]
+        last += 4
+    nodes += [Conv((last,), "conv_mid"), Add((first, last + 1)), Conv((last + 2,), "conv_out")]
+    return tuple(nodes)
+
+
+def _blocks(params: Params) -> int:
+    blocks = sum(layer.endswith("_prelu") for layer in params)
+    expected = {layer for node in _graph(blocks) if (layer := getattr(node, "layer", None))}
+    if not blocks or set(params) != expected:
+        raise ValueError(
+            f"the weights hold the layers {', '.join(sorted(params))}; expected those of a residual "
+            "network: conv_in, prelu_in, block1_conv1, block1_prelu, block1_conv2, ..., conv_mid, conv_out."
+        )
+    return blocks
