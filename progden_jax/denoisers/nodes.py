@@ -48,10 +48,10 @@ class Affine:
 
 @dataclasses.dataclass(frozen=True)
 class BatchNorm:
-    """Scale and shift per channel of what its mean and variance over a batch of images are taken out of.
+    """Normalisation of each channel by its mean and variance over a batch of images, then scale and shift.
 
-    For training; the batch is the mapped axis `BATCH` (``jax.vmap(..., axis_name=BATCH)``), and no image of it
-    is padded.
+    For training; the batch is the mapped axis `BATCH` (``jax.vmap(..., axis_name=BATCH)``), and none of its
+    images is padded.
     """
 
     source: int

@@ -1,9 +1,9 @@
 """The project's own denoisers, trained from scratch: a U-Net and a kernel-predicting network.
 
-`residual` has a third. Both see log(1 + v) / log(65505) of radiance and albedo, normals moved to [0, 1] and the arctangent of
-the variance, and no exposure is sought (Firmino et al. 2022, section 5.1, has none). The variance
-is a constant in derivatives with respect to the colour, as albedo and normal are: SURE's divergence is that
-of y = f(x) at fixed σ².
+`residual` has a third. Both see log(1 + v) / log(65505) of radiance and albedo, normals moved to [0, 1] and
+the arctangent of the variance, and no exposure is sought (Firmino et al. 2022, section 5.1, has none). The
+variance is a constant in derivatives with respect to the colour, as albedo and normal are: SURE's divergence
+is that of y = f(x) at fixed σ².
 """
 
 import functools
@@ -87,10 +87,12 @@ class LogNetwork(Network):
         return he_params(key, nodes, shapes, gains)
 
 
-def quietened(params: dict[str, Any], layer: str, bias: float) -> dict[str, Any]:
-    """A tenth of that layer's kernel, and its bias: the network starts near a constant output."""
+def quietened(
+    params: dict[str, Any], layer: str, bias: float, *, share: float = 0.1
+) -> dict[str, Any]:
+    """That share of the layer's kernel, and its bias: the network starts near a constant output."""
     last = params[layer]
-    changed = {"kernel": 0.1 * last["kernel"], "bias": jnp.full_like(last["bias"], bias)}
+    changed = {"kernel": share * last["kernel"], "bias": jnp.full_like(last["bias"], bias)}
     return params | {layer: changed}
 
 

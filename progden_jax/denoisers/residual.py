@@ -1,20 +1,24 @@
 """A deep residual network that maps noisy pixels to clean ones directly."""
 
 import functools
+import math
 from collections.abc import Mapping
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from progden_jax import _checks, transfer
-from progden_jax.denoisers._network import Params, lit
+from progden_jax.denoisers._network import Params
 from progden_jax.denoisers.graph import Add, Conv, Input, LeakyRelu, Node
 from progden_jax.denoisers.own import LOG_GAIN, LogNetwork, quietened
 
 _SLOPE = 0.25
 """Of the PReLUs at first (He et al. 2015)."""
+
+_HIGHEST = 2.0
+"""Transferred radiance, 4e9, that the output is cut off at: its exponential stays finite."""
 
 
 @jax.tree_util.register_pytree_with_keys_class
@@ -22,7 +26,7 @@ class ResidualNet(LogNetwork):
     """Residual blocks between two convolutions, and a skip around them all: a pytree of its weights.
 
     A block adds to its input what two 3×3 convolutions with a PReLU between make of it. It sees and gives
-    log(1 + radiance), sees log(1 + depth), and albedo and normal as they are. In training, batch
+    log(1 + radiance), sees log(1 + depth), and albedo and normal as they are, within their ranges. In training, batch
     normalisation follows the convolutions in blocks and the one after them
     (`progden_jax.training.normalization`); here it is part of their weights.
 
@@ -44,12 +48,11 @@ class ResidualNet(LogNetwork):
 
     Notes
     -----
-    The paper takes x and y of normals in view space. A frame does not say where the camera looks, so all three
-    components are taken in whatever space they come, world space as a rule. Renders to denoise must be as
-    those that were trained on: in that, and in the unit of depth, but for what training varies
-    (``depth_stops``). PReLUs have a slope per channel, so that images may have any size; the paper's
-    13.8 million weights come out with one per channel and pixel of its 64×64 patches. "conv_in"
-    and "conv_out" have biases.
+    The paper takes x and y of normals in view space. A frame does not say where the camera looks, so all
+    three components are taken in whatever space they come, as a rule the world's. In that and in the unit of
+    depth, renders must be as those trained on; training can vary the unit (``depth_stops``). PReLUs have a
+    slope per channel, so that images may have any size: the paper's 13.8 million weights come out with one
+    per channel and pixel of its 64×64 patches. The first and the last layer have biases here.
     """
 
     buffers: ClassVar[tuple[str, ...]] = ("albedo", "normal", "depth", "variance")
@@ -68,7 +71,7 @@ class ResidualNet(LogNetwork):
     ) -> Self:
         """A network to train: He's random weights, zero biases, PReLUs of slope 0.25.
 
-        The last layer has a tenth of its weights and a bias that stands for radiance 0.74, because what
+        The last layer has a small share of its weights and a bias that stands for radiance 0.74, because what
         is below 0 is cut off: a channel that began there everywhere would never learn.
 
         Parameters
@@ -82,7 +85,9 @@ class ResidualNet(LogNetwork):
         nodes = _graph(blocks)
         shapes = {node.layer: (3, width) for node in nodes if isinstance(node, Conv)}
         shapes["conv_out"] = (3, 3)
-        params = quietened(cls.he_params(key, inputs, nodes, shapes), "conv_out", 0.05)
+        params = cls.he_params(key, inputs, nodes, shapes)
+        # Every block adds to what the last layer sees.
+        params = quietened(params, "conv_out", 0.05, share=0.02 / math.sqrt(blocks + 2))
         slope = jnp.full(width, _SLOPE, params["conv_in"]["bias"].dtype)
         slopes = {node.layer: {"slope": slope} for node in nodes if isinstance(node, LeakyRelu)}
         return cls(params | slopes, inputs, name=name, precision=precision)
@@ -99,7 +104,7 @@ class ResidualNet(LogNetwork):
     def transferred(self, role: str, buffer: Array) -> Array:
         match role:
             case "albedo":
-                return lit(buffer)
+                return jnp.clip(buffer, 0, 1)
             case "normal":
                 return jnp.clip(buffer, -1, 1)
             case _:
@@ -107,7 +112,7 @@ class ResidualNet(LogNetwork):
 
     def decode(self, y: Array, exposure: None) -> Array:
         del exposure
-        return transfer.log1p_normalized_inverse(jax.nn.relu(y))
+        return transfer.log1p_normalized_inverse(jnp.clip(y, 0, _HIGHEST))
 
 
 @functools.cache

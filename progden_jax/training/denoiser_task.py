@@ -29,9 +29,9 @@ _BATCHES = 8
 class DenoiserTask:
     """A denoiser from scratch; its weights are the denoiser itself, as a pytree. See `step.Task`.
 
-    One with batch normalisation is a `BatchNormalized` while it is trained. The statistics that are kept in its
-    place are no moving averages, which lag behind the weights and are not those of averaged weights,
-    but computed for the weights to be evaluated (Wu and Johnson 2021, "PreciseBN").
+    One with batch normalisation is a `BatchNormalized` while it is trained. The statistics that stay in the
+    end are no moving averages, which lag behind the weights and are not those of averaged weights, but
+    computed for the very weights that are evaluated (Wu and Johnson 2021, "PreciseBN").
 
     The loss is of y = f(x) against the reference, or, with the loss "sure", Stein's estimate of y's error
     over y² + 0.01, which needs no reference: only renders with their variances. The divergence is then
