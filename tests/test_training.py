@@ -690,20 +690,25 @@ def test_training_a_denoiser(folder, tmp_path):
 
 
 def test_denoiser_configurations(folder):
-    assert config.names(DenoiserConfig) == ("cpu", "gpu", "kpcn", "paper", "small", "smoke")
+    named = {"cpu", "gpu", "kpcn", "paper", "residual", "residual-small", "small", "smoke"}
+    assert set(config.names(DenoiserConfig)) == named
     for name in config.names(DenoiserConfig):
         config.load(DenoiserConfig, name)
     for changes, message in (
         ({"architecture": "vit"}, "architecture is 'vit', expected one of 'unet', 'kpcn'"),
         ({"options": {"depth": 2}}, "options is {'depth': 2}: .*depth"),
         ({"inputs": ["albedo"]}, "has no albedo, which this denoiser takes"),
+        (
+            {"inputs": ["depth"]},
+            "inputs is 'depth', expected one of 'albedo', 'normal', 'variance'",
+        ),
         ({"weights_dtype": "bfloat16"}, "weights_dtype is 'bfloat16', expected one of 'float32'"),
     ):
         values = {"data": [str(folder)], "crop": 16, **changes}
         with pytest.raises(ValueError, match=message):
             DenoiserTask(config.load(DenoiserConfig, "smoke", values))
-    with pytest.raises(ValueError, match="inputs is 'depth', expected one of 'albedo'"):
-        config.load(DenoiserConfig, "smoke", {"inputs": ["depth"]})
+    with pytest.raises(ValueError, match="inputs is 'position', expected one of 'albedo'"):
+        config.load(DenoiserConfig, "smoke", {"inputs": ["position"]})
 
 
 def test_a_batch_that_devices_cannot_share(trainer):

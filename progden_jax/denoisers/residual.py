@@ -26,8 +26,8 @@ class ResidualNet(LogNetwork):
     """Residual blocks between two convolutions, and a skip around them all: a pytree of its weights.
 
     A block adds to its input what two 3×3 convolutions with a PReLU between make of it. It sees and gives
-    log(1 + radiance), sees log(1 + depth), and albedo and normal as they are, within their ranges. In training, batch
-    normalisation follows the convolutions in blocks and the one after them
+    log(1 + radiance), sees log(1 + depth), and albedo and normal as they are, within their ranges. In
+    training, batch normalisation follows the convolutions in blocks and the one after them
     (`progden_jax.training.normalization`); here it is part of their weights.
 
     With n blocks it reaches 2n + 3 pixels, and its exact divergence takes some 3(2n + 4)² passes by coloring
