@@ -52,7 +52,7 @@ def convolved(images, kernel):
 
 
 def reference(params, images, *, scales=None):
-    """The network as the paper has it, on transferred inputs (N, H, W, C); normalised where it has `scales`."""
+    """The network as the paper has it, on transferred inputs (N, H, W, C); normalised where `scales` say."""
     params = jax.tree.map(lambda a: np.asarray(a, np.float64), params)
 
     def conv(x, layer):
@@ -70,7 +70,7 @@ def reference(params, images, *, scales=None):
         inner = prelu(conv(x, f"block{n}_conv1"), f"block{n}_prelu")
         x = x + conv(inner, f"block{n}_conv2")
     out = conv(first + conv(x, "conv_mid"), "conv_out")
-    return np.expm1(np.log(65505) * np.clip(out, 0, 2))
+    return np.expm1(np.clip(out, 0, 22))
 
 
 def shown(frame):
@@ -78,8 +78,9 @@ def shown(frame):
     color, albedo, normal, depth = (
         np.asarray(a, np.float64) for a in (frame.color, frame.albedo, frame.normal, frame.depth)
     )
-    log = [np.log1p(np.maximum(a, 0)) / np.log(65505) for a in (color, depth)]
-    return np.concatenate([log[0], np.clip(albedo, 0, 1), normal, log[1]], -1)
+    return np.concatenate(
+        [np.log1p(np.maximum(color, 0)), np.clip(albedo, 0, 1), normal, np.log1p(depth)], -1
+    )
 
 
 def test_forward_pass_is_the_papers(frame):

@@ -87,12 +87,10 @@ class LogNetwork(Network):
         return he_params(key, nodes, shapes, gains)
 
 
-def quietened(
-    params: dict[str, Any], layer: str, bias: float, *, share: float = 0.1
-) -> dict[str, Any]:
-    """That share of the layer's kernel, and its bias: the network starts near a constant output."""
+def quietened(params: dict[str, Any], layer: str, bias: float) -> dict[str, Any]:
+    """A tenth of that layer's kernel, and its bias: the network starts near a constant output."""
     last = params[layer]
-    changed = {"kernel": share * last["kernel"], "bias": jnp.full_like(last["bias"], bias)}
+    changed = {"kernel": 0.1 * last["kernel"], "bias": jnp.full_like(last["bias"], bias)}
     return params | {layer: changed}
 
 

@@ -1,7 +1,6 @@
 """A deep residual network that maps noisy pixels to clean ones directly."""
 
 import functools
-import math
 from collections.abc import Mapping
 from typing import ClassVar, Self
 
@@ -9,16 +8,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from progden_jax import _checks, transfer
-from progden_jax.denoisers._network import Params
+from progden_jax import _checks
+from progden_jax.denoisers._network import Params, lit
 from progden_jax.denoisers.graph import Add, Conv, Input, LeakyRelu, Node
-from progden_jax.denoisers.own import LOG_GAIN, LogNetwork, quietened
+from progden_jax.denoisers.own import LogNetwork, quietened
 
 _SLOPE = 0.25
 """Of the PReLUs at first (He et al. 2015)."""
 
-_HIGHEST = 2.0
-"""Transferred radiance, 4e9, that the output is cut off at: its exponential stays finite."""
+_HIGHEST = 22.0
+"""Logarithm that the output is cut off at, of radiance 4e9: its exponential stays finite."""
 
 
 @jax.tree_util.register_pytree_with_keys_class
@@ -56,7 +55,7 @@ class ResidualNet(LogNetwork):
     """
 
     buffers: ClassVar[tuple[str, ...]] = ("albedo", "normal", "depth", "variance")
-    gains: ClassVar[Mapping[str, float]] = {"color": LOG_GAIN, "depth": LOG_GAIN}
+    gains: ClassVar[Mapping[str, float]] = {}
 
     @classmethod
     def init(
@@ -71,8 +70,8 @@ class ResidualNet(LogNetwork):
     ) -> Self:
         """A network to train: He's random weights, zero biases, PReLUs of slope 0.25.
 
-        The last layer has a small share of its weights and a bias that stands for radiance 0.74, because what
-        is below 0 is cut off: a channel that began there everywhere would never learn.
+        The last layer has a tenth of its weights and a bias that stands for radiance 0.65, because what is
+        below 0 is cut off: a channel that began there everywhere would never learn.
 
         Parameters
         ----------
@@ -86,8 +85,7 @@ class ResidualNet(LogNetwork):
         shapes = {node.layer: (3, width) for node in nodes if isinstance(node, Conv)}
         shapes["conv_out"] = (3, 3)
         params = cls.he_params(key, inputs, nodes, shapes)
-        # Every block adds to what the last layer sees.
-        params = quietened(params, "conv_out", 0.05, share=0.02 / math.sqrt(blocks + 2))
+        params = quietened(params, "conv_out", 0.5)
         slope = jnp.full(width, _SLOPE, params["conv_in"]["bias"].dtype)
         slopes = {node.layer: {"slope": slope} for node in nodes if isinstance(node, LeakyRelu)}
         return cls(params | slopes, inputs, name=name, precision=precision)
@@ -101,18 +99,24 @@ class ResidualNet(LogNetwork):
         layers = (node.layer for node in self.nodes if isinstance(node, Conv))
         return tuple(layer for layer in layers if layer not in ("conv_in", "conv_out"))
 
+    def encode(self, x: Array, exposure: None) -> Array:
+        del exposure
+        return jnp.log1p(lit(x))
+
     def transferred(self, role: str, buffer: Array) -> Array:
         match role:
             case "albedo":
                 return jnp.clip(buffer, 0, 1)
             case "normal":
                 return jnp.clip(buffer, -1, 1)
+            case "depth":
+                return jnp.log1p(lit(buffer))
             case _:
                 return super().transferred(role, buffer)
 
     def decode(self, y: Array, exposure: None) -> Array:
         del exposure
-        return transfer.log1p_normalized_inverse(jnp.clip(y, 0, _HIGHEST))
+        return jnp.expm1(jnp.clip(y, 0, _HIGHEST))
 
 
 @functools.cache
