@@ -10,7 +10,7 @@ import pytest
 import progden_jax as pd
 from progden_jax.denoisers import ResidualNet, graph, nodes
 from progden_jax.divergence import _reach
-from progden_jax.training import DenoiserConfig, DenoiserTask, Trainer, augment, config
+from progden_jax.training import DenoiserConfig, DenoiserTask, Trainer, config
 from progden_jax.training.normalization import BATCH, BatchNormalized, pooled
 from progden_jax.training.step import schedule
 
@@ -107,14 +107,14 @@ def test_size_and_start_of_the_papers_network():
     )
     assert len([node for node in net.nodes if isinstance(node, graph.Conv)]) == 35
     assert len(net.normalized) == 33
-    small = ResidualNet.init(jax.random.key(0), INPUTS, blocks=1, width=256)
+    small = ResidualNet.init(jax.random.key(0), INPUTS, blocks=1, width=64)
     block = small.params["block1_conv1"]["kernel"]
-    np.testing.assert_allclose(block.std(), np.sqrt(2 / (9 * 256)), rtol=0.01)
-    np.testing.assert_array_equal(small.params["block1_prelu"]["slope"], np.full(256, 0.25))
+    np.testing.assert_allclose(block.std(), np.sqrt(2 / (9 * 64)), rtol=0.02)
+    np.testing.assert_array_equal(small.params["block1_prelu"]["slope"], np.full(64, 0.25))
 
 
 def test_any_inputs(frame):
-    for inputs in ((), ("variance",), (*INPUTS, "variance")):
+    for inputs in ((), (*INPUTS, "variance")):
         net = network(1, 2, inputs)
         assert jax.eval_shape(net, frame).shape == frame.color.shape
         for role in inputs:
@@ -192,7 +192,7 @@ def trained() -> BatchNormalized:
 
 @jax.jit
 def together(trained, frames):
-    """Outputs, moments and a gradient."""
+    """Outputs, moments, and the gradient of the mean logarithm."""
 
     def mean(trained):
         def one(frame):
@@ -206,14 +206,20 @@ def together(trained, frames):
 
 
 def test_normalised_over_the_batch(trained, batch):
-    """Against the network in float64; every weight learns; folded, each image alone gives the same."""
+    """As in float64, its derivative along a random direction too; folded, each image alone gives the same."""
     y, moments, gradient = together(trained, batch)
     inputs = np.stack([shown(jax.tree.map(lambda a, n=n: a[n], batch)) for n in range(3)])
-    expected = reference(trained.network.params, inputs, scales=trained.scales)
-    np.testing.assert_allclose(y, expected, rtol=1e-3, atol=1e-4)
-    for path, leaf in jax.tree_util.tree_leaves_with_path(gradient):
-        assert np.isfinite(leaf).all(), path
-        assert np.asarray(leaf).any(), path
+
+    def dense(step=0.0):
+        moved = jax.tree.map(lambda a, d: np.asarray(a, np.float64) + step * d, trained, towards)
+        return reference(moved.network.params, inputs, scales=moved.scales)
+
+    rng = np.random.default_rng(5)
+    towards = jax.tree.map(lambda a: rng.normal(size=np.shape(a)), trained)
+    np.testing.assert_allclose(y, dense(), rtol=1e-3, atol=1e-4)
+    up, down = (np.log1p(dense(step)).mean() for step in (1e-6, -1e-6))
+    along = sum(jax.tree.leaves(jax.tree.map(lambda g, d: np.vdot(g, d), gradient, towards)))
+    np.testing.assert_allclose(along, (up - down) / 2e-6, rtol=1e-3)
     folded = trained.folded(moments)
     assert isinstance(folded, ResidualNet)
     for n in range(3):
@@ -258,25 +264,6 @@ def test_files_round_trip(tmp_path, frame):
     assert jax.eval_shape(again, frame).shape == frame.color.shape
 
 
-def test_depth_in_other_units():
-    example = {"color": np.ones((4, 4, 3), np.float32), "depth": np.full((4, 4, 1), 3, np.float32)}
-    chosen = DenoiserConfig(steps=1, crop=4, depth_stops=2.0, exposure_stops=1.0)
-    keys = jax.random.split(jax.random.key(0), 100)
-
-    @jax.jit
-    @jax.vmap
-    def run(key):
-        change = augment.draw(key, (4, 4), chosen)
-        return change.depth_stops, change.stops, augment.apply(change, example, crop=4)
-
-    depth_stops, stops, changed = run(keys)
-    assert depth_stops.min() < -1.8
-    assert depth_stops.max() > 1.8
-    assert abs(np.corrcoef(depth_stops, stops)[0, 1]) < 0.4
-    np.testing.assert_allclose(changed["depth"][:, 0, 0, 0], 3 * 2**depth_stops, rtol=1e-5)
-    np.testing.assert_allclose(changed["color"][:, 0, 0, 0], 2**stops, rtol=1e-5)
-
-
 def test_rates_by_stages():
     paper = config.load(DenoiserConfig, "residual")
     rate = schedule(paper)
@@ -313,17 +300,16 @@ def renders(tmp_path_factory):
 def test_training_and_going_on(renders, tmp_path):
     """Stopped and gone on with, the weights are the same bit for bit; they load as what was evaluated."""
     changes = {"data": [str(renders)], "held_out_scenes": ["two"], "batch": 2, "crop": 16}
-    changes |= {"options": {"blocks": 1, "width": 4}, "steps": 6, "log_every": 1}
-    changes |= {"evaluate_every": 3, "checkpoint_every": 3, "weights_dtype": "float32"}
+    changes |= {"options": {"blocks": 1, "width": 4}, "steps": 4, "log_every": 1}
+    changes |= {"evaluate_every": 2, "checkpoint_every": 2, "weights_dtype": "float32"}
     task = DenoiserTask(config.load(DenoiserConfig, "residual-small", changes))
     trainer = Trainer(task, devices=jax.devices()[:1])
     whole = trainer.run(tmp_path / "whole")
-    trainer.run(tmp_path / "parts", until=3)
+    half = trainer.run(tmp_path / "parts", until=2)
     parts = trainer.run(tmp_path / "parts")
     for one, other in zip(jax.tree.leaves(whole.state), jax.tree.leaves(parts.state), strict=True):
         np.testing.assert_array_equal(one, other)
-    start = jax.jit(task.init)(jax.random.key(0))
-    changed = jax.tree.map(lambda a, b: bool((a != b).any()), start, whole.state.params)
+    changed = jax.tree.map(lambda a, b: bool((a != b).any()), half.state.params, whole.state.params)
     assert all(jax.tree.leaves(changed))
     loaded = pd.denoisers.load(parts.weights)
     assert isinstance(loaded, ResidualNet)
