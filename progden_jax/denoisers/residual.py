@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from progden_jax import _checks
 from progden_jax.denoisers._network import Params, lit
-from progden_jax.denoisers.graph import Add, Conv, Input, LeakyRelu, Node
+from progden_jax.denoisers.graph import Add, Conv, Input, LeakyRelu, Node, Pointwise
 from progden_jax.denoisers.own import LogNetwork, quietened
 
 _SLOPE = 0.25
@@ -35,7 +35,7 @@ class ResidualNet(LogNetwork):
     Parameters
     ----------
     params : layers "conv_in", "prelu_in", for each block "block1_conv1", "block1_prelu", "block1_conv2", ...,
-        then "conv_mid" and "conv_out".
+        then "conv_mid" and "conv_out", or "conv_difference" where the colour is added to what it gives.
     inputs : buffers taken besides the colour, in this order: some of "albedo", "normal", "depth" and
         "variance". The paper's are all but the last.
     name : for messages; by default the architecture's.
@@ -65,39 +65,43 @@ class ResidualNet(LogNetwork):
         *,
         blocks: int = 16,
         width: int = 128,
+        difference: bool = False,
         name: str | None = None,
         precision: str = "highest",
     ) -> Self:
         """A network to train: He's random weights, zero biases, PReLUs of slope 0.25.
 
-        The last layer has a tenth of its weights and a bias that stands for radiance 0.65, because what is
-        below 0 is cut off: a channel that began there everywhere would never learn.
+        The last layer has a tenth of its weights and, unless it gives differences, a bias that stands for
+        radiance 0.65, because what is below 0 is cut off: a channel that began there everywhere would
+        never learn.
 
         Parameters
         ----------
         key : of the random numbers.
         inputs : see `ResidualNet`.
         blocks, width : number of residual blocks, and their channels: 16 and 128 make 4.9 million weights.
+        difference : the logarithm of the noisy colour is added in the end. Not in the paper; a short training
+            would be spent on learning to pass the colour on.
         """
         _checks.positive_int("blocks", blocks)
         _checks.positive_int("width", width)
-        nodes = _graph(blocks)
+        nodes, last = _graph(blocks, difference), _LAST[difference]
         shapes = {node.layer: (3, width) for node in nodes if isinstance(node, Conv)}
-        shapes["conv_out"] = (3, 3)
+        shapes[last] = (3, 3)
         params = cls.he_params(key, inputs, nodes, shapes)
-        params = quietened(params, "conv_out", 0.5)
+        params = quietened(params, last, 0.0 if difference else 0.5)
         slope = jnp.full(width, _SLOPE, params["conv_in"]["bias"].dtype)
         slopes = {node.layer: {"slope": slope} for node in nodes if isinstance(node, LeakyRelu)}
         return cls(params | slopes, inputs, name=name, precision=precision)
 
     @property
     def nodes(self) -> tuple[Node, ...]:
-        return _graph(_blocks(self.params))
+        return _graph(*_form(self.params))
 
     @property
     def normalized(self) -> tuple[str, ...]:
         layers = (node.layer for node in self.nodes if isinstance(node, Conv))
-        return tuple(layer for layer in layers if layer not in ("conv_in", "conv_out"))
+        return tuple(layer for layer in layers if layer not in ("conv_in", *_LAST.values()))
 
     def encode(self, x: Array, exposure: None) -> Array:
         del exposure
@@ -119,8 +123,11 @@ class ResidualNet(LogNetwork):
         return jnp.expm1(jnp.clip(y, 0, _HIGHEST))
 
 
+_LAST = {False: "conv_out", True: "conv_difference"}
+
+
 @functools.cache
-def _graph(blocks: int) -> tuple[Node, ...]:
+def _graph(blocks: int, difference: bool) -> tuple[Node, ...]:
     nodes: list[Node] = [Input(), Conv((0,), "conv_in"), LeakyRelu(1, "prelu_in")]
     first = last = 2
     for number in range(1, blocks + 1):
@@ -131,16 +138,29 @@ def _graph(blocks: int) -> tuple[Node, ...]:
             Add((last, last + 3)),
         ]
         last += 4
-    nodes += [Conv((last,), "conv_mid"), Add((first, last + 1)), Conv((last + 2,), "conv_out")]
+    nodes += [
+        Conv((last,), "conv_mid"),
+        Add((first, last + 1)),
+        Conv((last + 2,), _LAST[difference]),
+    ]
+    if difference:
+        nodes += [Pointwise(0, _unchanged, channels=3), Add((last + 3, last + 4))]
     return tuple(nodes)
 
 
-def _blocks(params: Params) -> int:
-    blocks = sum(layer.endswith("_prelu") for layer in params)
-    expected = {layer for node in _graph(blocks) if (layer := getattr(node, "layer", None))}
+def _unchanged(x: Array) -> Array:
+    return x
+
+
+def _form(params: Params) -> tuple[int, bool]:
+    """Number of blocks, and whether the last layer gives differences."""
+    blocks, difference = sum(n.endswith("_prelu") for n in params), _LAST[True] in params
+    nodes = _graph(blocks, difference)
+    expected = {layer for node in nodes if (layer := getattr(node, "layer", None))}
     if not blocks or set(params) != expected:
         raise ValueError(
             f"the weights hold the layers {', '.join(sorted(params))}; expected those of a residual "
-            "network: conv_in, prelu_in, block1_conv1, block1_prelu, block1_conv2, ..., conv_mid, conv_out."
+            "network: conv_in, prelu_in, block1_conv1, block1_prelu, block1_conv2, ..., conv_mid, conv_out "
+            "or conv_difference."
         )
-    return blocks
+    return blocks, difference
