@@ -18,12 +18,11 @@ INPUTS = ("albedo", "normal", "depth")
 SIZE = (10, 11)
 
 
-def network(blocks=2, width=4, inputs=INPUTS, seed=0) -> ResidualNet:
+def network(blocks=2, width=4, inputs=INPUTS, **settings) -> ResidualNet:
     """One with random biases and slopes too, whose outputs vary."""
-    form = jax.eval_shape(
-        lambda: ResidualNet.init(jax.random.key(0), inputs, blocks=blocks, width=width)
-    )
-    rng = np.random.default_rng(seed)
+    settings |= {"blocks": blocks, "width": width}
+    form = jax.eval_shape(lambda: ResidualNet.init(jax.random.key(0), inputs, **settings))
+    rng = np.random.default_rng(0)
 
     def one(path, like):
         part = path[-1].key
@@ -32,7 +31,8 @@ def network(blocks=2, width=4, inputs=INPUTS, seed=0) -> ResidualNet:
         return (drawn + 0.1 if part == "slope" else drawn).astype(np.float32)
 
     params = jax.tree_util.tree_map_with_path(one, form.params)
-    params["conv_out"]["bias"] += 0.3
+    if "conv_out" in params:
+        params["conv_out"]["bias"] += 0.3
     return ResidualNet(params, inputs)
 
 
@@ -69,7 +69,9 @@ def reference(params, images, *, scales=None):
     for n in range(1, 1 + sum(layer.endswith("conv1") for layer in params)):
         inner = prelu(conv(x, f"block{n}_conv1"), f"block{n}_prelu")
         x = x + conv(inner, f"block{n}_conv2")
-    out = conv(first + conv(x, "conv_mid"), "conv_out")
+    x = first + conv(x, "conv_mid")
+    difference = "conv_difference" in params
+    out = conv(x, "conv_difference" if difference else "conv_out") + difference * images[..., :3]
     return np.expm1(np.clip(out, 0, 22))
 
 
@@ -83,8 +85,9 @@ def shown(frame):
     )
 
 
-def test_forward_pass_is_the_papers(frame):
-    net = network()
+@pytest.mark.parametrize("difference", [False, True])
+def test_forward_pass_is_the_papers(frame, difference):
+    net = network(difference=difference)
     expected = reference(net.params, shown(frame)[None])[0]
     assert expected.std() > 0.1
     assert (expected == 0).any()
@@ -150,7 +153,7 @@ def test_exact_divergence_in_float64(frame):
     """By coloring and by cone as by unit vectors, where the image is larger than the reach."""
     with jax.enable_x64(True):
         wide, net = jax.tree.map(
-            lambda a: jnp.asarray(np.asarray(a), jnp.float64), (frame, network())
+            lambda a: jnp.asarray(np.asarray(a), jnp.float64), (frame, network(difference=True))
         )
 
         @jax.jit
@@ -182,7 +185,7 @@ def batch(frame):
 @pytest.fixture(scope="module")
 def trained() -> BatchNormalized:
     """A network in training, with scales of all sizes."""
-    start = BatchNormalized.of(network())
+    start = BatchNormalized.of(network(difference=True))
     assert set(start.scales) == set(start.network.normalized)
     assert all((scale == 1).all() for scale in start.scales.values())
     rng = np.random.default_rng(4)
