@@ -1,9 +1,11 @@
 """The project's own denoisers, trained from scratch: a U-Net and a kernel-predicting network.
 
-`residual` has a third. Both see log(1 + v) / log(65505) of radiance and albedo, normals moved to [0, 1] and
-the arctangent of the variance, and no exposure is sought (Firmino et al. 2022, section 5.1, has none). The
-variance is a constant in derivatives with respect to the colour, as albedo and normal are: SURE's divergence
-is that of y = f(x) at fixed σ².
+(A third is in `progden_jax.denoisers.residual`.)
+
+Both see log(1 + v) / log(65505) of radiance and albedo, normals moved to [0, 1] and the arctangent of
+the variance, and no exposure is sought (Firmino et al. 2022, section 5.1, has none). The variance
+is a constant in derivatives with respect to the colour, as albedo and normal are: SURE's divergence is that
+of y = f(x) at fixed σ².
 """
 
 import functools
@@ -81,7 +83,7 @@ class LogNetwork(Network):
         nodes: tuple[Node, ...],
         shapes: Mapping[str, tuple[int, int]],
     ) -> dict[str, Any]:
-        """He's weights for these inputs, see `_network.he_params`."""
+        """He's weights for these inputs, see the function `he_params`."""
         roles = ("color", *inputs)
         gains = [cls.gains.get(role, 1.0) for role in roles for _ in range(channels_of(role))]
         return he_params(key, nodes, shapes, gains)

@@ -1,4 +1,4 @@
-"""Noisy features smoothed, each guided by itself, before `nfor` models radiance by them."""
+"""Noisy features smoothed, each guided by itself, before `progden_jax.denoisers.nfor` models by them."""
 
 from collections.abc import Mapping
 
