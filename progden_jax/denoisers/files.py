@@ -49,7 +49,7 @@ def save(
         If the denoiser is none of the project's own, a weight is not finite in `dtype`, or metadata uses
         a name that the file needs.
     """
-    names = {kind: name for name, kind in ARCHITECTURES.items()}
+    names: dict[type, str] = {kind: name for name, kind in ARCHITECTURES.items()}
     if type(denoiser) not in names:
         raise ValueError(
             f"the denoiser is a {type(denoiser).__name__}, expected a "
