@@ -297,7 +297,7 @@ def test_weights_that_do_not_fit(tmp_path):
         KPCN.init(jax.random.key(0), kernel_size=4)
     with pytest.raises(ValueError, match="conv1.bias are not all finite in float16"):
         pd.denoisers.save(path, KPCN(changed("conv1", bias=np.full(8, 1e6))))
-    with pytest.raises(ValueError, match="expected a UNet or a KPCN: OIDN's weights go to a .tza"):
+    with pytest.raises(ValueError, match="a KPCN or a ResidualNet: OIDN's weights go to a .tza"):
         pd.denoisers.save(path, pd.denoisers.load("oidn-hdr-small"))  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="metadata has inputs, which the file itself tells"):
         pd.denoisers.save(path, net, metadata={"inputs": "albedo"})

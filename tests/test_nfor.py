@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 import progden_jax as pd
-from progden_jax.denoisers import NFOR, _regression, nfor
-from progden_jax.denoisers._regression import Windows, regress
+from progden_jax.denoisers import NFOR, _regression, prefiltering
+from progden_jax.denoisers._patches import Windows
+from progden_jax.denoisers._regression import regress
 
 SMALL = NFOR(radius=2, patch=1, inputs=("albedo", "depth"))
 SIZE = (11, 19)
@@ -182,14 +183,14 @@ def test_prefiltered_features(noisy):
     frame = FRAME.replace(albedo=None, normal=None, depth=None)
     small = jax.tree.map(lambda a: a[: SIZE[0], : SIZE[1]], frame)
     small = small.replace(albedo=(truth + noise).astype(np.float32))
-    found = nfor.prefiltered(small, {"albedo": np.full(truth.shape, 0.01, np.float32)})
+    found = prefiltering.prefiltered(small, {"albedo": np.full(truth.shape, 0.01, np.float32)})
     assert np.abs(found.albedo - truth).mean() < 0.4 * np.abs(noise).mean()
     with pytest.raises(
         ValueError, match="a variance of the normal is given, and this frame has none"
     ):
-        nfor.prefiltered(small, {"normal": small.albedo})
+        prefiltering.prefiltered(small, {"normal": small.albedo})
     with pytest.raises(ValueError, match="variances is 'color'"):
-        nfor.prefiltered(small, {"color": small.color})
+        prefiltering.prefiltered(small, {"color": small.color})
 
 
 @pytest.mark.parametrize(

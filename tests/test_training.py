@@ -218,10 +218,11 @@ def test_augmentation_is_consistent():
     rng = np.random.default_rng(0)
     names = ("color", "denoised", "variance", "divergence", "reference", "albedo", "normal")
     example = {n: rng.random((6, 6, 3), np.float32) for n in names}
+    example["depth"] = rng.random((6, 6, 1), np.float32)
     example["mean_variance"] = np.float32(0.5)
     sure = pd.sure(*(example[n] for n in ("color", "denoised", "variance", "divergence")))
     keys = jax.random.split(jax.random.key(0), 200)
-    chosen = MixerConfig(steps=1, crop=4, exposure_stops=2.0)
+    chosen = MixerConfig(steps=1, crop=4, exposure_stops=2.0, depth_stops=1.0)
 
     @jax.jit
     @jax.vmap
@@ -239,6 +240,10 @@ def test_augmentation_is_consistent():
     assert scale.max() > 3
     np.testing.assert_allclose(many["mean_variance"], 0.5 * scale**2, rtol=1e-5)
     assert many["albedo"].max() <= 1
+    unit = np.exp2(change.depth_stops)
+    assert unit.min() < 0.55
+    assert unit.max() > 1.8
+    assert abs(np.corrcoef(change.depth_stops, change.stops)[0, 1]) < 0.3
     symmetries = {(bool(a), bool(b), bool(c)) for a, b, c in zip(*change[2:5], strict=True)}
     assert len(symmetries) == 8
     assert set(change.order) == set(range(6))
@@ -247,8 +252,9 @@ def test_augmentation_is_consistent():
         c = jax.tree.map(lambda a, i=i: a[i], change)
         expected = example["color"][c.row : c.row + 4, c.column : c.column + 4]
         normal = example["normal"][c.row : c.row + 4, c.column : c.column + 4]
+        depth = example["depth"][c.row : c.row + 4, c.column : c.column + 4]
         if c.transpose:
-            expected, normal = expected.swapaxes(0, 1), normal.swapaxes(0, 1)
+            expected, normal, depth = (a.swapaxes(0, 1) for a in (expected, normal, depth))
         rows, columns = (
             slice(None, None, 1 - 2 * c.flip_rows),
             slice(None, None, 1 - 2 * c.flip_columns),
@@ -258,6 +264,7 @@ def test_augmentation_is_consistent():
             many["color"][i], expected[rows, columns][..., colors] * scale[i], rtol=1e-6
         )
         np.testing.assert_array_equal(many["normal"][i], normal[rows, columns])
+        np.testing.assert_allclose(many["depth"][i], depth[rows, columns] * unit[i], rtol=1e-6)
 
 
 def test_turns_without_flips_are_rotations():
@@ -690,20 +697,25 @@ def test_training_a_denoiser(folder, tmp_path):
 
 
 def test_denoiser_configurations(folder):
-    assert config.names(DenoiserConfig) == ("cpu", "gpu", "kpcn", "paper", "small", "smoke")
+    named = {"cpu", "gpu", "kpcn", "paper", "residual", "residual-small", "small", "smoke"}
+    assert set(config.names(DenoiserConfig)) == named
     for name in config.names(DenoiserConfig):
         config.load(DenoiserConfig, name)
     for changes, message in (
         ({"architecture": "vit"}, "architecture is 'vit', expected one of 'unet', 'kpcn'"),
         ({"options": {"depth": 2}}, "options is {'depth': 2}: .*depth"),
         ({"inputs": ["albedo"]}, "has no albedo, which this denoiser takes"),
+        (
+            {"inputs": ["depth"]},
+            "inputs is 'depth', expected one of 'albedo', 'normal', 'variance'",
+        ),
         ({"weights_dtype": "bfloat16"}, "weights_dtype is 'bfloat16', expected one of 'float32'"),
     ):
         values = {"data": [str(folder)], "crop": 16, **changes}
         with pytest.raises(ValueError, match=message):
             DenoiserTask(config.load(DenoiserConfig, "smoke", values))
-    with pytest.raises(ValueError, match="inputs is 'depth', expected one of 'albedo'"):
-        config.load(DenoiserConfig, "smoke", {"inputs": ["depth"]})
+    with pytest.raises(ValueError, match="inputs is 'position', expected one of 'albedo'"):
+        config.load(DenoiserConfig, "smoke", {"inputs": ["position"]})
 
 
 def test_a_batch_that_devices_cannot_share(trainer):

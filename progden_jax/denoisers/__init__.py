@@ -10,10 +10,11 @@ from progden_jax import _checks, _safetensors
 from progden_jax.denoisers import files, graph, nfor, oidn, unet
 from progden_jax.denoisers._base import Bound, Denoiser, FunctionDenoiser
 from progden_jax.denoisers._network import PRECISIONS, Network
-from progden_jax.denoisers.files import save, save_tza
+from progden_jax.denoisers.files import ARCHITECTURES, save, save_tza
 from progden_jax.denoisers.nfor import NFOR
 from progden_jax.denoisers.oidn import OIDN
-from progden_jax.denoisers.own import ARCHITECTURES, INPUT_SETS, KPCN, UNet
+from progden_jax.denoisers.own import INPUT_SETS, KPCN, UNet
+from progden_jax.denoisers.residual import ResidualNet
 from progden_jax.denoisers.tza import read_tza, write_tza
 from progden_jax.frame import Frame
 
@@ -28,6 +29,7 @@ __all__ = [
     "Denoiser",
     "FunctionDenoiser",
     "Network",
+    "ResidualNet",
     "UNet",
     "for_frame",
     "load",
@@ -63,7 +65,7 @@ def load(
     Parameters
     ----------
     name : one of `names()`, such as "oidn-hdr-alb-nrm", or the path of a file that ends in .tza (an `OIDN`)
-        or .safetensors (a `UNet` or `KPCN`, as `save` wrote it).
+        or .safetensors (a `UNet`, `KPCN` or `ResidualNet`, as `save` wrote it).
     exposure : see `OIDN`; no other takes one.
     inputs : auxiliary buffers of a .tza file's network; by default by its number of input channels:
         3 radiance, 6 with albedo, 9 with albedo and normal.

@@ -33,6 +33,22 @@ class Denoiser(Protocol):
         ...
 
 
+class Bounded:
+    """A bound denoiser that reaches as far as its ``denoiser`` says."""
+
+    denoiser: Any
+
+    @property
+    def receptive_radius(self) -> int:
+        """How many pixels away an output pixel can depend on the input."""
+        return self.denoiser.receptive_radius
+
+    @property
+    def alignment(self) -> int:
+        """Pixels after which the way that outputs depend on inputs repeats."""
+        return self.denoiser.alignment
+
+
 @jax.tree_util.register_pytree_node_class
 class FunctionDenoiser:
     """A JAX function of the colour alone as a denoiser: ``FunctionDenoiser(lambda x: ...)``.

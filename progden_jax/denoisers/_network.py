@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from progden_jax import _checks
 from progden_jax.denoisers import graph
-from progden_jax.denoisers._base import Bound
+from progden_jax.denoisers._base import Bound, Bounded
 from progden_jax.denoisers.graph import Layered, Node
 from progden_jax.frame import Frame
 
@@ -50,7 +50,8 @@ class Network:
         self.inputs = inputs
         self.name = name
         self.precision = precision
-        widths, expected = graph.channels(self.nodes, params), 3 * (1 + len(inputs))
+        widths = graph.channels(self.nodes, params)
+        expected = sum(channels_of(role) for role in ("color", *inputs))
         if widths[0] != expected:
             raise ValueError(
                 f"the weights of {name} take {widths[0]} input channels; radiance with "
@@ -72,7 +73,7 @@ class Network:
         """Radiance from the network's output."""
         raise NotImplementedError
 
-    def transferred(self, role: str, buffer: Float[Array, "h w 3"]) -> Float[Array, "h w 3"]:
+    def transferred(self, role: str, buffer: Float[Array, "h w c"]) -> Float[Array, "h w c"]:
         """An auxiliary buffer as the network sees it."""
         raise NotImplementedError
 
@@ -109,6 +110,11 @@ class Network:
         if exposure is None:
             exposure = self.exposure_of(frame, valid)
         return BoundNetwork(self, tuple(auxiliary), exposure, valid)
+
+    @property
+    def normalized(self) -> tuple[str, ...]:
+        """Layers whose outputs are normalised over batches while they are trained."""
+        return ()
 
     @property
     def receptive_radius(self) -> int:
@@ -149,7 +155,7 @@ def _jitted_call(denoiser: Network, frame: Frame) -> Array:
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class BoundNetwork:
+class BoundNetwork(Bounded):
     """y = f(x) for one frame: what `Network.bind` gives."""
 
     denoiser: Network
@@ -161,16 +167,6 @@ class BoundNetwork:
         """The denoised image, (H, W, 3) linear radiance."""
         _checks.image("x", x)
         return _run_bound(self, x)
-
-    @property
-    def receptive_radius(self) -> int:
-        """How many pixels away an output pixel can depend on the input."""
-        return self.denoiser.receptive_radius
-
-    @property
-    def alignment(self) -> int:
-        """Pixels after which the way that outputs depend on inputs repeats."""
-        return self.denoiser.alignment
 
     @property
     def layers(self) -> tuple[tuple[Node, ...], Params]:
@@ -213,7 +209,7 @@ def _run_bound(f: BoundNetwork, x: Array) -> Array:
 def run(
     nodes: Sequence[Node],
     params: Params,
-    channels: tuple[Float[Array, "h w 3"], ...],
+    channels: tuple[Float[Array, "h w _"], ...],
     *,
     valid: Valid = None,
     precision: str = "highest",
@@ -233,6 +229,11 @@ def run(
         precision=lax.Precision.HIGHEST if precision == "highest" else cast(Any, precision),
     )
     return y[:height, :width]
+
+
+def channels_of(role: str) -> int:
+    """How many channels that buffer of a frame has."""
+    return 1 if role == "depth" else 3
 
 
 def lit(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:

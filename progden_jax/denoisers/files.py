@@ -7,8 +7,16 @@ from pathlib import Path
 from progden_jax import _safetensors
 from progden_jax.denoisers import unet
 from progden_jax.denoisers.oidn import INPUTS, OIDN
-from progden_jax.denoisers.own import ARCHITECTURES, KPCN, UNet
+from progden_jax.denoisers.own import KPCN, LogNetwork, UNet
+from progden_jax.denoisers.residual import ResidualNet
 from progden_jax.denoisers.tza import write_tza
+
+ARCHITECTURES: dict[str, type[UNet] | type[KPCN] | type[ResidualNet]] = {
+    "unet": UNet,
+    "kpcn": KPCN,
+    "residual": ResidualNet,
+}
+"""The project's own networks, by the name that weight files use."""
 
 FOLDER = Path(__file__).parents[1] / "weights"
 """Weights that come with the package: NAME.safetensors, NAME beginning with the architecture."""
@@ -22,7 +30,7 @@ def shipped() -> dict[str, Path]:
 
 def save(
     path: str | os.PathLike[str],
-    denoiser: UNet | KPCN,
+    denoiser: LogNetwork,
     *,
     dtype: str = "float16",
     metadata: Mapping[str, str] | None = None,
@@ -41,11 +49,11 @@ def save(
         If the denoiser is none of the project's own, a weight is not finite in `dtype`, or metadata uses
         a name that the file needs.
     """
-    names = {kind: name for name, kind in ARCHITECTURES.items()}
+    names: dict[type, str] = {kind: name for name, kind in ARCHITECTURES.items()}
     if type(denoiser) not in names:
         raise ValueError(
-            f"the denoiser is a {type(denoiser).__name__}, expected a UNet or a KPCN: "
-            "OIDN's weights go to a .tza file (save_tza)."
+            f"the denoiser is a {type(denoiser).__name__}, expected a "
+            f"{' or a '.join(kind.__name__ for kind in names)}: OIDN's weights go to a .tza file (save_tza)."
         )
     own = {"architecture": names[type(denoiser)], "inputs": ",".join(denoiser.inputs)}
     if clash := {*own, "format", "dtype"} & set(metadata or {}):
@@ -55,7 +63,7 @@ def save(
 
 def load_own(
     path: str | os.PathLike[str], *, name: str | None = None, precision: str = "highest"
-) -> UNet | KPCN:
+) -> UNet | KPCN | ResidualNet:
     """The network that `save` wrote.
 
     Raises

@@ -16,8 +16,11 @@ from jaxtyping import Array, Float
 from progden_jax._convolution import same_convolution, upsampled_convolution
 from progden_jax._numeric import own_zero
 from progden_jax.denoisers.nodes import (
+    BATCH,
+    BATCH_EPSILON,
     Add,
     Affine,
+    BatchNorm,
     Conv,
     Filter,
     Input,
@@ -33,12 +36,14 @@ from progden_jax.denoisers.nodes import (
 __all__ = [
     "Add",
     "Affine",
+    "BatchNorm",
     "Conv",
     "Filter",
     "Input",
     "Layered",
     "LeakyRelu",
     "MaxPool",
+    "Moments",
     "Node",
     "Pointwise",
     "Relu",
@@ -71,6 +76,13 @@ class Layered(NamedTuple):
     """Derivative of the transferred colour with respect to x, per pixel and channel."""
     decode: Callable[[Array], Array]
     """From the network's output (H, W, 3) to y, per pixel and channel."""
+
+
+class Moments(NamedTuple):
+    """Mean and variance of each channel over a batch of images."""
+
+    mean: Float[Array, " c"]
+    variance: Float[Array, " c"]
 
 
 class Weighted(NamedTuple):
@@ -190,8 +202,9 @@ def evaluate(
     """The output, and what fixes the derivative, per node that has more to it than its parameters.
 
     Of each `Relu` where it passes and of each `LeakyRelu` where its input is positive (bool), of each
-    `Pointwise` its slope, of each `MaxPool` which of four won (uint8), of each `Filter` a `Weighted`, and the
-    image's extent, (h, w, 1), for each `Conv` that nothing read from it bounds to that.
+    `Pointwise` its slope, of each `MaxPool` which of four won (uint8), of each `Filter` a `Weighted`, of each
+    `BatchNorm` the `Moments`, and the image's extent, (h, w, 1), for each `Conv` that nothing read from it
+    bounds to that.
 
     `inside` (H, W, 1) is False where the input is padding around the image that a traced size leaves.
     `precision` is that of the convolutions: JAX's, or "bfloat16", which rounds their inputs and kernels to
@@ -237,6 +250,8 @@ def evaluate(
             case Affine():
                 layer = params[node.layer]
                 value = bounded(values[node.source] * layer["scale"] + layer["shift"], level)
+            case BatchNorm():
+                value, kept[index] = _normalized(params[node.layer], values[node.source])
             case Pointwise():
                 x = values[node.source][..., : node.channels]
                 value, slope = jax.jvp(node.function, (x,), (jnp.ones_like(x),))
@@ -286,6 +301,13 @@ def _convolve_upsampled(layer: Any, low: Array, others: Sequence[Array], precisi
     kernel = jnp.asarray(layer["kernel"])
     value = upsampled_convolution(low[None], skip[None], kernel, precision)[0]
     return value + layer["bias"] if "bias" in layer else value
+
+
+def _normalized(layer: Any, x: Array) -> tuple[Array, Moments]:
+    mean = lax.pmean(x.mean((0, 1)), BATCH)
+    variance = lax.pmean(((x - mean) ** 2).mean((0, 1)), BATCH)
+    gain = layer["scale"] * lax.rsqrt(variance + BATCH_EPSILON)
+    return (x - mean) * gain + layer["shift"], Moments(mean, variance)
 
 
 def _filter(image: Array, logits: Array, size: int, mask: Array | None) -> Weighted:

@@ -6,7 +6,6 @@ depth says how they differ. How strictly the weights choose is decided per pixel
 
 import dataclasses
 import functools
-from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -16,9 +15,10 @@ from jaxtyping import Array, Float
 
 from progden_jax import _checks
 from progden_jax._windows import box_sum
-from progden_jax.denoisers._base import Bound
+from progden_jax.denoisers._base import Bound, Bounded
 from progden_jax.denoisers._network import PRECISIONS, Valid, inside_of
-from progden_jax.denoisers._regression import BLOCK, Windows, regress
+from progden_jax.denoisers._patches import BLOCK, Windows
+from progden_jax.denoisers._regression import regress
 from progden_jax.frame import Frame
 
 NAME = "nfor"
@@ -31,9 +31,6 @@ _RISK_RADIUS = 7
 
 _CHOICE_RADIUS = 2
 """Pixels over which the choice of a bandwidth is smoothed, so that no seams show."""
-
-_PREFILTER = Windows(radius=5, patch=3)
-_PREFILTER_BANDWIDTH = 0.5
 
 
 @functools.partial(
@@ -180,7 +177,7 @@ def _call(denoiser: NFOR, frame: Frame) -> Array:
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class BoundNFOR:
+class BoundNFOR(Bounded):
     """y = f(x) for one frame: what `NFOR.bind` gives.
 
     The choice of bandwidths counts as constant in derivatives.
@@ -197,16 +194,6 @@ class BoundNFOR:
         _checks.image("x", x)
         _checks.same_shape("x", x, "the frame's variance", self.variance)
         return _run(self, x)
-
-    @property
-    def receptive_radius(self) -> int:
-        """How many pixels away an output pixel can depend on the input."""
-        return self.denoiser.receptive_radius
-
-    @property
-    def alignment(self) -> int:
-        """Pixels after which the way that outputs depend on inputs repeats."""
-        return self.denoiser.alignment
 
 
 @jax.jit
@@ -265,46 +252,3 @@ def _repeated(image: Float[Array, "h w c"], valid: Any) -> Float[Array, "h w c"]
         index = jnp.minimum(jnp.arange(image.shape[axis]), size - 1)
         image = jnp.take(image, index, axis=axis)
     return image
-
-
-def prefiltered(frame: Frame, variances: Mapping[str, Float[Array, "h w c"]]) -> Frame:
-    """The frame with its noisy features smoothed by non-local means, each guided by itself.
-
-    Parameters
-    ----------
-    frame : one frame; features that no variance is given for stay as they are.
-    variances : of the mean, by feature ("albedo", "normal", "depth"), in its shape.
-
-    Raises
-    ------
-    ValueError
-        If a name is no feature, the frame lacks it, or shapes differ.
-
-    Notes
-    -----
-    Bitterli et al. 2016, section 5.1.
-    """
-    filtered = {}
-    for role, variance in variances.items():
-        _checks.choice("variances", role, FEATURES)
-        buffer = getattr(frame, role)
-        if buffer is None:
-            raise ValueError(f"a variance of the {role} is given, and this frame has none.")
-        _checks.same_shape(f"variances[{role!r}]", variance, f"frame.{role}", buffer)
-        filtered[role] = _prefilter(buffer, variance)
-    return frame.replace(**filtered)
-
-
-@jax.jit
-def _prefilter(buffer: Array, variance: Array) -> Array:
-    found = regress(
-        buffer,
-        buffer[..., :0],
-        buffer,
-        variance,
-        jnp.ones(buffer.shape[:2], bool),
-        windows=_PREFILTER,
-        bandwidths=(_PREFILTER_BANDWIDTH,),
-        ridge=1.0,  # of no slopes
-    )
-    return found.image[0]

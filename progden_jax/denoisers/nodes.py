@@ -4,7 +4,7 @@ A network is a tuple of them in order of evaluation, each naming the nodes that 
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from jaxtyping import Array
 
@@ -44,6 +44,25 @@ class Affine:
     source: int
     layer: str
     """Name of the parameters {"scale": (channels,), "shift": (channels,)}."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BatchNorm:
+    """Normalisation of each channel by its mean and variance over a batch of images, then scale and shift.
+
+    For training; the batch is the mapped axis `BATCH` (``jax.vmap(..., axis_name=BATCH)``), and none of its
+    images is padded.
+    """
+
+    source: int
+    layer: str
+    """Name of the parameters {"scale": (channels,), "shift": (channels,)}."""
+
+
+BATCH = "batch of images"
+
+BATCH_EPSILON = 1e-5
+"""Added to the variance, so that a channel that is the same everywhere stays finite."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,7 +108,19 @@ class Filter:
     size: int
 
 
-Node = Input | Conv | Relu | LeakyRelu | Affine | Pointwise | MaxPool | Upsample | Add | Filter
+Node = (
+    Input
+    | Conv
+    | Relu
+    | LeakyRelu
+    | Affine
+    | BatchNorm
+    | Pointwise
+    | MaxPool
+    | Upsample
+    | Add
+    | Filter
+)
 
 
 def sources(node: Node) -> tuple[int, ...]:
@@ -103,3 +134,18 @@ def sources(node: Node) -> tuple[int, ...]:
             return (node.image, node.logits)
         case _:
             return (node.source,)
+
+
+def moved(node: Node, places: Sequence[int]) -> Node:
+    """The node in a graph where the nodes that it reads are at these places."""
+    match node:
+        case Input():
+            return node
+        case Conv(sources=read):
+            return dataclasses.replace(node, sources=tuple(places[s] for s in read))
+        case Add(sources=(first, second)):
+            return dataclasses.replace(node, sources=(places[first], places[second]))
+        case Filter(image=image, logits=logits):
+            return dataclasses.replace(node, image=places[image], logits=places[logits])
+        case _:
+            return dataclasses.replace(node, source=places[node.source])

@@ -1,5 +1,7 @@
 """The project's own denoisers, trained from scratch: a U-Net and a kernel-predicting network.
 
+(A third is in `progden_jax.denoisers.residual`.)
+
 Both see log(1 + v) / log(65505) of radiance and albedo, normals moved to [0, 1] and the arctangent of
 the variance, and no exposure is sought (Firmino et al. 2022, section 5.1, has none). The variance
 is a constant in derivatives with respect to the colour, as albedo and normal are: SURE's divergence is that
@@ -8,7 +10,8 @@ of y = f(x) at fixed σ².
 
 import functools
 import math
-from typing import Any, Self
+from collections.abc import Mapping
+from typing import Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +22,7 @@ from progden_jax.denoisers import unet
 from progden_jax.denoisers._network import (
     Network,
     Params,
+    channels_of,
     he_params,
     lit,
     normal_to_unit,
@@ -33,14 +37,21 @@ INPUT_SETS: dict[str, tuple[str, ...]] = {
 }
 """The paper's input sets (Table 1): what each takes besides the colour."""
 
-BUFFERS = ("albedo", "normal", "variance")
-
-_LOG_GAIN = math.log(65505) / math.log(2)
-"""Brings the transferred radiance 1, which is 1/16, to the size of about 1 that He's weights expect."""
+LOG_GAIN = math.log(65505) / math.log(2)
+"""Brings the transferred radiance 1, which is 1/16, to 1."""
 
 
-class _Own(Network):
-    """A network between log(1 + ·) transfers."""
+class LogNetwork(Network):
+    """A network between log(1 + ·) transfers.
+
+    Attributes
+    ----------
+    buffers : what it may take besides the colour.
+    gains : what brings an input's channels to the size of about 1 that He's weights expect, where it isn't 1.
+    """
+
+    buffers: ClassVar[tuple[str, ...]] = ("albedo", "normal", "variance")
+    gains: ClassVar[Mapping[str, float]] = {"color": LOG_GAIN, "albedo": LOG_GAIN}
 
     def __init__(
         self,
@@ -51,7 +62,7 @@ class _Own(Network):
         precision: str = "highest",
     ) -> None:
         for role in inputs:
-            _checks.choice("inputs", role, BUFFERS)
+            _checks.choice("inputs", role, self.buffers)
         name = type(self).__name__.lower() if name is None else name
         super().__init__(params, tuple(inputs), name=name, precision=precision)
 
@@ -64,16 +75,21 @@ class _Own(Network):
             return normal_to_unit(buffer)
         return (transfer.arctan if role == "variance" else transfer.log1p_normalized)(lit(buffer))
 
+    @classmethod
+    def he_params(
+        cls,
+        key: jax.Array,
+        inputs: tuple[str, ...],
+        nodes: tuple[Node, ...],
+        shapes: Mapping[str, tuple[int, int]],
+    ) -> dict[str, Any]:
+        """He's weights for these inputs, see the function `he_params`."""
+        roles = ("color", *inputs)
+        gains = [cls.gains.get(role, 1.0) for role in roles for _ in range(channels_of(role))]
+        return he_params(key, nodes, shapes, gains)
 
-def _gains(inputs: tuple[str, ...]) -> list[float]:
-    """Of every input channel, see `he_params`: logarithms alone are far from 1."""
-    return [gain for role in ("color", *inputs) for gain in [_GAINS.get(role, 1.0)] * 3]
 
-
-_GAINS = {"color": _LOG_GAIN, "albedo": _LOG_GAIN}
-
-
-def _quietened(params: dict[str, Any], layer: str, bias: float) -> dict[str, Any]:
+def quietened(params: dict[str, Any], layer: str, bias: float) -> dict[str, Any]:
     """A tenth of that layer's kernel, and its bias: the network starts near a constant output."""
     last = params[layer]
     changed = {"kernel": 0.1 * last["kernel"], "bias": jnp.full_like(last["bias"], bias)}
@@ -81,7 +97,7 @@ def _quietened(params: dict[str, Any], layer: str, bias: float) -> dict[str, Any
 
 
 @jax.tree_util.register_pytree_with_keys_class
-class UNet(_Own):
+class UNet(LogNetwork):
     """OIDN's U-Net with weights of its own, from and to log(1 + radiance): a pytree of its weights.
 
     Parameters
@@ -120,8 +136,8 @@ class UNet(_Own):
         """
         _checks.choice("size", size, unet.SIZES)
         shapes = unet.shapes(size)
-        params = he_params(key, unet.graph(shapes), shapes, _gains(inputs))
-        params = _quietened(params, list(shapes)[-1], 0.05)
+        params = cls.he_params(key, inputs, unet.graph(shapes), shapes)
+        params = quietened(params, list(shapes)[-1], 0.05)
         return cls(params, inputs, name=name, precision=precision)
 
     @property
@@ -134,7 +150,7 @@ class UNet(_Own):
 
 
 @jax.tree_util.register_pytree_with_keys_class
-class KPCN(_Own):
+class KPCN(LogNetwork):
     """A network that predicts for every pixel the kernel which filters the radiance around it.
 
     Convolutions with ReLUs end in one logit per tap; y_p = Σ_q w_pq x_q with w their softmax, over the
@@ -182,7 +198,7 @@ class KPCN(_Own):
         shapes = {f"conv{n}": (layer_size, width) for n in range(1, layers + 1)}
         shapes["kernel"] = (layer_size, kernel_size**2)
         nodes = _kpcn_graph(layers, kernel_size)
-        params = _quietened(he_params(key, nodes, shapes, _gains(inputs)), "kernel", 0.0)
+        params = quietened(cls.he_params(key, inputs, nodes, shapes), "kernel", 0.0)
         return cls(params, inputs, name=name, precision=precision)
 
     @property
@@ -219,7 +235,3 @@ def _kpcn_sizes(params: Params) -> tuple[int, int]:
             f"the layer kernel predicts {taps} logits per pixel; expected an odd number squared, such as 25."
         )
     return len(params) - 1, math.isqrt(taps)
-
-
-ARCHITECTURES: dict[str, type[UNet] | type[KPCN]] = {"unet": UNet, "kpcn": KPCN}
-"""By the name that weight files use."""

@@ -1,4 +1,4 @@
-"""Random crops, mirrorings, quarter turns, orders of colour and exposures of one example.
+"""Random crops, mirrorings, quarter turns, orders of colour, exposures and units of length of one example.
 
 All buffers of an example are changed alike, so that what is computed from them afterwards (SURE, features)
 belongs to the changed example. Three things are worth knowing:
@@ -36,6 +36,8 @@ _RADIANCE_POWER = {
 }
 """By what power of s a buffer grows when radiance grows by s; buffers not listed do not."""
 
+_LENGTHS = ("depth",)
+
 _UNCOLORED = ("normal", "depth", "mean_variance")
 ORDERS = np.asarray([(0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)])
 """Orders of the colour channels, the unchanged one first."""
@@ -51,6 +53,7 @@ class Change(NamedTuple):
     flip_columns: Array | bool = False
     order: Array | int = 0
     stops: Array | float = 0.0
+    depth_stops: Array | float = 0.0
 
 
 def draw(key: jax.Array, size: tuple[int, int], config: RunConfig) -> Change:
@@ -69,7 +72,12 @@ def draw(key: jax.Array, size: tuple[int, int], config: RunConfig) -> Change:
     flip_columns = coins[2] if config.flips else turned if config.turns else none
     order = jax.random.randint(keys[5], (), 0, len(ORDERS)) if config.permute_colors else 0
     stops = config.exposure_stops * jax.random.uniform(keys[6], minval=-1, maxval=1)
-    return Change(row, column, transpose, flip_rows, flip_columns, jnp.asarray(order), stops)
+    # By a key of its own: the others' draws stay as they were.
+    unit = jax.random.uniform(jax.random.fold_in(key, 7), minval=-1, maxval=1)
+    depth_stops = config.depth_stops * unit
+    return Change(
+        row, column, transpose, flip_rows, flip_columns, jnp.asarray(order), stops, depth_stops
+    )
 
 
 def apply(
@@ -94,5 +102,7 @@ def apply(
 def _recolored(change: Change, name: str, buffer: Array) -> Array:
     if name not in _UNCOLORED:
         buffer = jnp.take(buffer, jnp.asarray(ORDERS)[change.order], axis=-1)
+    if name in _LENGTHS:
+        return buffer * jnp.exp2(change.depth_stops)
     power = _RADIANCE_POWER.get(name, 0)
     return buffer * jnp.exp2(power * change.stops) if power else buffer

@@ -36,11 +36,14 @@ class RunConfig:
     turns: bool = True  # turn crops by random quarters
     permute_colors: bool = True  # random order of red, green and blue
     exposure_stops: float = 0.0  # radiance times 2^u, u uniform between minus and plus this
+    depth_stops: float = 0.0  # depth likewise: scenes have units of their own
     loss: str = "smape"  # smape, relmse, l1, logl1, log-errors, or sure (no reference needed)
     peak_rate: float = 1e-3  # highest learning rate of the cycle
     warmup: float = 0.3  # share of steps until the peak
     start_divisor: float = 25.0  # first rate: the peak over this
     end_divisor: float = 1e4  # last rate: the first over this
+    rates: tuple[float, ...] = ()  # learning rates of stages, instead of one cycle
+    rate_steps: tuple[int, ...] = ()  # at which the stages after the first begin
     weight_decay: float = 0.0  # decoupled, per unit of learning rate
     clip_norm: float = 1.0  # of the whole gradient; 0: not clipped
     ema: float = 0.0  # decay of the averaged weights that are evaluated and saved; 0: the last ones
@@ -57,12 +60,13 @@ class RunConfig:
         _within(self, "held_out", 0, 1, "a share of the scenes", closed=False)
         _within(self, "warmup", 0, 1, "a share of the steps", closed=False)
         _within(self, "ema", 0, 1, "a decay below 1, such as 0.999")
-        for name in ("exposure_stops", "weight_decay", "clip_norm"):
+        for name in ("exposure_stops", "depth_stops", "weight_decay", "clip_norm"):
             _within(self, name, 0, float("inf"), "a number from 0 up")
         for name in ("reference_spp", "patience", "seed"):
             _within(self, name, 0, 2**32, "a whole number from 0 up")
         for name in ("peak_rate", "start_divisor", "end_divisor"):
             _within(self, name, 0, float("inf"), "a number above 0", closed=False)
+        _check_stages(self.rates, self.rate_steps)
         _checks.choice("loss", self.loss, (*SUPERVISED, "log-errors", "sure"))
         _checks.choice("precision", self.precision, ("default", "high", "highest"))
 
@@ -95,8 +99,8 @@ class MixerConfig(RunConfig):
 class DenoiserConfig(RunConfig):
     """How to train a denoiser."""
 
-    architecture: str = "unet"  # or kpcn, see progden_jax.denoisers.own.ARCHITECTURES
-    inputs: tuple[str, ...] = ()  # buffers besides the colour, of albedo, normal and variance
+    architecture: str = "unet"  # see progden_jax.denoisers.ARCHITECTURES
+    inputs: tuple[str, ...] = ()  # buffers besides the colour, as the architecture takes them
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # as size of a unet
     probes: int = 1  # loss sure: of the divergence, drawn anew each step
     weights_dtype: str = "float32"  # of the weights file; float16 halves it, to three digits
@@ -106,7 +110,7 @@ class DenoiserConfig(RunConfig):
         _checks.positive_int("probes", self.probes)
         _checks.choice("weights_dtype", self.weights_dtype, ("float32", "float16"))
         for role in self.inputs:
-            _checks.choice("inputs", role, ("albedo", "normal", "variance"))
+            _checks.choice("inputs", role, ("albedo", "normal", "depth", "variance"))
 
 
 Config = TypeVar("Config", bound=RunConfig)
@@ -264,3 +268,13 @@ def _within(
     value = getattr(config, name)
     if not (low <= value <= high if closed else low < value < high):
         raise ValueError(f"{name} is {value}, expected {what}.")
+
+
+def _check_stages(rates: tuple[float, ...], steps: tuple[int, ...]) -> None:
+    rising = all(a < b for a, b in zip((0, *steps), steps, strict=False))
+    if len(steps) != max(len(rates) - 1, 0) or not rising:
+        raise ValueError(
+            f"rate_steps is {steps} and rates is {rates}, expected rising steps, one less than the rates."
+        )
+    if not all(0 < rate < float("inf") for rate in rates):
+        raise ValueError(f"rates is {rates}, expected numbers above 0.")

@@ -1,5 +1,6 @@
 """What it is to train a denoiser: its examples, loss and evaluation."""
 
+import functools
 import os
 from collections.abc import Mapping
 from typing import Any
@@ -10,18 +11,27 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from progden_jax import _checks
-from progden_jax.denoisers import files, own
+from progden_jax.denoisers import Network, files
+from progden_jax.denoisers.graph import Moments
 from progden_jax.divergence import MonteCarlo
 from progden_jax.frame import Frame
 from progden_jax.sure import sure
-from progden_jax.training import augment, data, evaluation, losses
+from progden_jax.training import augment, data, evaluation, losses, order
 from progden_jax.training.config import DenoiserConfig
+from progden_jax.training.normalization import BATCH, BatchNormalized, pooled
 
-_BUFFERS = ("albedo", "normal")
+_BUFFERS = ("albedo", "normal", "depth")
+
+_BATCHES = 8
+"""Batches of training examples that batch normalisation's final statistics are taken over."""
 
 
 class DenoiserTask:
     """A denoiser from scratch; its weights are the denoiser itself, as a pytree. See `step.Task`.
+
+    One with batch normalisation is a `BatchNormalized` while it is trained. The statistics that stay in the
+    end are no moving averages, which lag behind the weights and are not those of averaged weights, but
+    computed for the very weights that are evaluated (Wu and Johnson 2021, "PreciseBN").
 
     The loss is of y = f(x) against the reference, or, with the loss "sure", Stein's estimate of y's error
     over y² + 0.01, which needs no reference: only renders with their variances. The divergence is then
@@ -46,7 +56,7 @@ class DenoiserTask:
         *,
         progress: data.Progress = lambda done, total: None,
     ) -> None:
-        _checks.choice("architecture", config.architecture, own.ARCHITECTURES)
+        _checks.choice("architecture", config.architecture, files.ARCHITECTURES)
         self.config = config
         try:
             jax.eval_shape(self.init, jax.random.key(0))
@@ -60,8 +70,9 @@ class DenoiserTask:
         self._held = {name: jnp.asarray(array) for name, array in held.arrays.items()}
 
     def init(self, key: jax.Array) -> Any:
-        kind: Any = own.ARCHITECTURES[self.config.architecture]
-        return kind.init(key, self.config.inputs, precision="default", **self.config.options)
+        kind: Any = files.ARCHITECTURES[self.config.architecture]
+        network = kind.init(key, self.config.inputs, precision="default", **self.config.options)
+        return BatchNormalized.of(network) if network.normalized else network
 
     def example(
         self, arrays: Mapping[str, Array], index: Array, key: jax.Array
@@ -77,7 +88,7 @@ class DenoiserTask:
         self, params: Any, batch: Mapping[str, Float[Array, "b ..."]]
     ) -> tuple[Array, dict[str, Array]]:
         """The loss over a batch of examples."""
-        return jax.vmap(self._one, (None, 0))(params, dict(batch)).mean(), {}
+        return jax.vmap(self._one, (None, 0), axis_name=BATCH)(params, dict(batch)).mean(), {}
 
     def _one(self, denoiser: Any, example: Mapping[str, Array]) -> Array:
         f, x = denoiser.bind(_frame(example)), example["color"]
@@ -89,18 +100,52 @@ class DenoiserTask:
 
     def evaluate(self, params: Any) -> evaluation.Scores:
         """RMSE and SMAPE on the held-out scenes; the score is the mean SMAPE."""
-        found = {name: np.asarray(v) for name, v in _held_errors(self._held, params).items()}
+        errors = _held_errors(self._held, self.finished(params))
+        found = {name: np.asarray(v) for name, v in errors.items()}
         table = evaluation.tabulate(self._held_items, found)
         return evaluation.Scores(float(found["denoised"][:, 1].mean()), table)
 
     def export(self, path: os.PathLike[str], params: Any, metadata: Mapping[str, str]) -> None:
         """Write weights that `denoisers.load` takes."""
-        files.save(path, params, dtype=self.config.weights_dtype, metadata=metadata)
+        network = self.finished(params)
+        files.save(path, network, dtype=self.config.weights_dtype, metadata=metadata)
+
+    def finished(self, params: Any) -> Any:
+        """The denoiser that the weights make, without batch normalisation."""
+        return _folded(params, self._batches) if isinstance(params, BatchNormalized) else params
+
+    @functools.cached_property
+    def _batches(self) -> dict[str, Array]:
+        """Examples as training sees them, (batches, batch, ...); the same each time."""
+        config, count = self.config, len(self.items)
+        chosen = np.concatenate(
+            [
+                order.indices(step, count=count, batch=config.batch, seed=config.seed)
+                for step in range(_BATCHES)
+            ]
+        )
+        arrays = {name: array[chosen] for name, array in self.arrays.items()}
+        keys = jax.random.split(jax.random.key(config.seed), len(chosen))
+        examples = jax.jit(jax.vmap(self.example, (None, 0, 0)))
+        found = examples(arrays, jnp.arange(len(chosen)), keys)
+        return jax.tree.map(lambda a: a.reshape(_BATCHES, config.batch, *a.shape[1:]), found)
 
 
 def _frame(example: Mapping[str, Array]) -> Frame:
     buffers = {role: example.get(role) for role in _BUFFERS}
     return Frame(example["color"], example["variance"], **buffers)
+
+
+@jax.jit
+def _folded(trained: BatchNormalized, batches: Mapping[str, Array]) -> Network:
+    """The network with the moments of all batches folded in."""
+
+    def moments(batch: Mapping[str, Array]) -> dict[str, Moments]:
+        over = jax.vmap(lambda e: trained.moments(_frame(e)), axis_name=BATCH, out_axes=None)
+        return over(dict(batch))
+
+    found = jax.lax.map(moments, dict(batches))
+    return trained.folded({layer: pooled(of_batches) for layer, of_batches in found.items()})
 
 
 @jax.jit

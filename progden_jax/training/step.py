@@ -68,7 +68,10 @@ class State(NamedTuple):
 
 
 def schedule(config: RunConfig) -> optax.Schedule:
-    """Learning rate per step: one cycle, up and down by cosines."""
+    """Learning rate per step: one cycle, up and down by cosines, or a constant per stage."""
+    if config.rates:
+        stages = [optax.constant_schedule(rate) for rate in config.rates]
+        return optax.join_schedules(stages, list(config.rate_steps))
     return optax.cosine_onecycle_schedule(
         config.steps,
         config.peak_rate,
@@ -79,7 +82,7 @@ def schedule(config: RunConfig) -> optax.Schedule:
 
 
 def optimizer(config: RunConfig) -> optax.GradientTransformation:
-    """Adam under the one-cycle schedule, the gradient clipped first."""
+    """Adam under the `schedule`, the gradient clipped first."""
     clip = [optax.clip_by_global_norm(config.clip_norm)] if config.clip_norm else []
     adam = optax.adamw(schedule(config), weight_decay=config.weight_decay)
     # All weights as one vector: fewer and larger operations.
