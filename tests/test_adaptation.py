@@ -11,9 +11,9 @@ from conftest import drawn
 
 import progden_jax as pd
 from progden_jax import adaptation
-from progden_jax.adaptation import by_sure, combination
+from progden_jax.adaptation import _blocks, combination
 
-SMALL = adaptation.PostCorrection(window=3, layers=2, width=4, patch=8, epochs=1, min_steps=1)
+SMALL = adaptation.PostCorrection(window=3, layers=2, width=4, patch=8, steps=1)
 
 
 @functools.partial(jax.tree_util.register_dataclass, data_fields=("gain", "rest"), meta_fields=())
@@ -246,7 +246,7 @@ def corrected():
     """A biased denoiser, too bright by half, corrected with few small steps."""
     frame, truth = frame_of(2, sigma=0.1)
     bright = Blur(jnp.float32(1), jnp.float32(0.5))
-    settings = dataclasses.replace(SMALL, min_steps=30, rate=0.01)
+    settings = dataclasses.replace(SMALL, steps=30, rate=0.01)
     halves = adaptation.split(frame, jax.random.key(5))
     return (
         halves,
@@ -301,13 +301,14 @@ def test_post_correction_goes_on_from_weights_and_follows_its_key(corrected):
 
 
 def test_patches_cover_the_image():
-    from progden_jax.adaptation.correction import _corners
+    from progden_jax.adaptation.by_halves import _corners
 
     corners = _corners((20, 7), 8)
     assert corners.tolist() == [[0, 0], [8, 0], [12, 0]]
 
 
-SURE = adaptation.Adaptation(steps=40, rate=0.02, block=4, every=5, crop=16)
+FOLDS = adaptation.Adaptation(folds=2)
+SURE = adaptation.Adaptation(steps=40, rate=0.02, folds=1, block=4, every=5, crop=16)
 
 
 @pytest.fixture(scope="module")
@@ -321,9 +322,10 @@ def test_adaptation_lowers_the_true_error(adapted):
     frame, truth, dim, found = adapted
     before, after = (((np.asarray(f(frame)) - truth) ** 2).mean() for f in (dim, found.adapted))
     assert after < 0.2 * before
-    assert found.step > 0
+    (fit,) = found.fits
+    assert fit.step > 0
     assert found.before - found.after > 2 * found.error
-    assert found.risks[-1] < found.risks[0]
+    assert fit.risks[-1] < fit.risks[0]
 
 
 def test_adaptation_follows_its_key_and_can_be_stopped(adapted):
@@ -333,8 +335,8 @@ def test_adaptation_follows_its_key_and_can_be_stopped(adapted):
     other = adaptation.adapt(frame, dim, adaptation=SURE, key=jax.random.key(1))
     assert jax.tree.leaves(other.adapted) != jax.tree.leaves(found.adapted)
     stopped = adaptation.adapt(frame, dim, adaptation=SURE, progress=lambda n, _: n < 7)
-    assert stopped.steps.tolist() == [0, 5, 7]
-    np.testing.assert_array_equal(stopped.risks[:2], found.risks[:2])
+    assert stopped.fits[0].steps.tolist() == [0, 5, 7]
+    np.testing.assert_array_equal(stopped.fits[0].risks[:2], found.fits[0].risks[:2])
 
 
 def test_what_is_right_already_stays(adapted):
@@ -344,7 +346,7 @@ def test_what_is_right_already_stays(adapted):
 
     identity = pd.FunctionDenoiser(jax.tree_util.Partial(lambda w, x: w * x, jnp.float32(1)))
     found = adaptation.adapt(frame, identity, adaptation=dataclasses.replace(SURE, steps=1))
-    assert found.step == 0
+    assert found.fits[0].step == 0
     assert jax.tree.leaves(found.adapted) == [1]
 
 
@@ -381,12 +383,45 @@ def test_a_mixer_is_adapted_by_the_risk_of_the_mix(adapted):
         adaptation.adapt_mixer(frame, BLUR, pd.ClosedForm())
 
 
-def test_blocks_hold_what_they_should():
-    kinds = by_sure._kinds((40, 60), 8, np.random.default_rng(0))
-    assert kinds.shape == (5, 8)
-    assert np.bincount(kinds.ravel()).tolist() == [24, 10, 6]
-    values = by_sure._spread(kinds, (40, 60)).astype(float)
-    np.testing.assert_array_equal(by_sure._block_means(values, kinds.shape), kinds)
+def test_folds_apply_weights_where_they_were_not_fitted(adapted):
+    """Each pixel has the weights of the one fold in which its block tells, and the whole is a denoiser."""
+    frame, _, dim, _ = adapted
+    settings = dataclasses.replace(SURE, folds=2, patience=1, steps=10)
+    calls = []
+    found = adaptation.adapt(
+        frame, dim, adaptation=settings, progress=lambda *call: calls.append(call)
+    )
+    assert calls == [(n, 20) for n in range(1, 21)]
+    assert found.before - found.after > 2 * found.error
+    masks = np.asarray(found.adapted.masks)
+    np.testing.assert_array_equal(masks.sum(0), 1)
+    one, two = (
+        Blur(*(np.asarray(leaf)[n] for leaf in jax.tree.leaves(found.adapted.stacked)))
+        for n in range(2)
+    )
+    assert one.gain != two.gain
+    expected = np.where(masks[0] > 0, one(frame), two(frame))
+    np.testing.assert_allclose(
+        jax.jit(lambda d, f: d(f))(found.adapted, frame), expected, rtol=1e-5
+    )
+    with pytest.raises(ValueError, match="adapt with folds=1"):
+        found.adapted(frame_of(0, size=(8, 8))[0])
+    stopped = adaptation.adapt(frame, dim, adaptation=settings, progress=lambda *_: False)
+    assert [fit.steps.tolist() for fit in stopped.fits] == [[0, 1], [0]]
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_blocks_hold_what_they_should(count):
+    folds = _blocks.folds((40, 60), 8, count, np.random.default_rng(0))
+    assert [kinds.shape for kinds in folds] == [(5, 8)] * count
+    told = np.stack([kinds == _blocks.TELL for kinds in folds])
+    np.testing.assert_array_equal(told.sum(0), 1 if count > 1 else told[0])
+    for kinds in folds:
+        fitting, choosing, telling = np.bincount(kinds.ravel()).tolist()
+        assert fitting > 2 * choosing
+        assert telling in ((6,) if count == 1 else (13, 14))
+    values = _blocks.spread(folds[0], (40, 60)).astype(float)
+    np.testing.assert_array_equal(_blocks.means(values, folds[0].shape), folds[0])
 
 
 @pytest.mark.parametrize(
@@ -405,6 +440,7 @@ def test_blocks_hold_what_they_should():
         (lambda f: adaptation.Adaptation(rate=-1), "rate is -1"),
         (lambda f: adaptation.Adaptation(confidence=-1), "confidence is -1"),
         (lambda f: adaptation.Adaptation(steps=0), "steps is 0"),
+        (lambda f: adaptation.adapt_mixer(f, BLUR, Constant(0.0), adaptation=FOLDS), "folds is 2"),
     ],
 )
 def test_bad_input_is_refused(call, message):

@@ -5,21 +5,19 @@ Two ways: `post_correct` trains a small network behind the denoiser on two halve
 estimate. What comes out of either can be given to `progden_jax.progressive_denoise`.
 """
 
+from progden_jax.adaptation._folds import CrossFitted
 from progden_jax.adaptation._halves import Halves, halves, split
-from progden_jax.adaptation.by_sure import Adaptation, Adapted, adapt, adapt_mixer
-from progden_jax.adaptation.correction import (
-    SETTINGS,
-    Corrected,
-    PostCorrected,
-    PostCorrection,
-    post_correct,
-)
+from progden_jax.adaptation.by_halves import Corrected, post_correct
+from progden_jax.adaptation.by_sure import Adaptation, Adapted, Fit, adapt, adapt_mixer
+from progden_jax.adaptation.correction import SETTINGS, PostCorrected, PostCorrection
 
 __all__ = [
     "SETTINGS",
     "Adaptation",
     "Adapted",
     "Corrected",
+    "CrossFitted",
+    "Fit",
     "Halves",
     "PostCorrected",
     "PostCorrection",

@@ -85,7 +85,10 @@ class _Pair(NamedTuple):
 
 
 class _Estimate(NamedTuple):
-    """The denoised image and what is known of it; only the image without an estimator."""
+    """The denoised image and what is known of it; only the image without an estimator.
+
+    `denoiser` is as it was before an adaptation: its mixer is found by it.
+    """
 
     denoiser: Denoiser
     denoised: Image
@@ -140,18 +143,19 @@ def _sound(frame: pd.Frame) -> pd.Frame:
 
 def _estimate(frame: pd.Frame, settings: Settings, max_memory: int | None) -> _Estimate:
     denoiser = parts.denoiser_for(frame, settings)
-    if isinstance(denoiser, Network):
+    if isinstance(denoiser, Network) and settings.adaptation != "post-correct":
         # Buffers that it does not look at would make other programs of the same.
         taken = {n: getattr(frame, n) for n in ("color", "variance", *denoiser.inputs)}
         frame = frame_of({name: buffer for name, buffer in taken.items() if buffer is not None})
+    fitted = functools.partial(parts.adapted, frame, denoiser, settings)
     method = settings.method()
     if method is None:
-        plain, seconds = _timed(lambda: pd.denoise(frame, denoiser, max_memory=max_memory))
+        plain, seconds = _timed(lambda: pd.denoise(frame, fitted(), max_memory=max_memory))
         return _Estimate(denoiser, np.asarray(plain.image), None, None, seconds)
     found, seconds = _timed(
         lambda: pd.progressive_denoise(
             frame,
-            denoiser,
+            fitted(),
             mixer=_Nothing(),
             bound=False,
             method=method,
