@@ -149,6 +149,11 @@ class PostCorrected:
     difference: dict[str, Array]
     correction: PostCorrection
 
+    @property
+    def name(self) -> str | None:
+        """The denoiser's, by which its mixer is found."""
+        return getattr(self.denoiser, "name", None)
+
     def __call__(self, frame: Frame) -> Float[Array, "h w 3"]:
         """The corrected image, (H, W, 3) linear radiance."""
         return self.bind(frame)(frame.color)
