@@ -19,17 +19,18 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from progden_jax import _checks
+from progden_jax._program import checked_variance
 from progden_jax.adaptation import _blocks, _leaves
 from progden_jax.adaptation._descent import Weights, descent, risks, task_of
 from progden_jax.adaptation._folds import cross_fitted
 from progden_jax.adaptation._mixed import Mixed
+from progden_jax.adaptation._pooling import pooled
 from progden_jax.adaptation._running import Progress, generator
 from progden_jax.denoisers import Denoiser
 from progden_jax.denoisers._base import passable
 from progden_jax.divergence import MonteCarlo
 from progden_jax.frame import Frame, repaired
 from progden_jax.mixing import Mixer
-from progden_jax._program import checked_variance
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,6 +45,8 @@ class Adaptation:
         none stands for all weights.
     folds : so many times weights are fitted, each time without a share of the blocks, where they are then
         applied. 1: once, and applied everywhere: SURE of what comes out is biased low.
+    pool : odd edge in pixels of the window that variances are averaged over for the fit; 1: as they are. A
+        pixel whose samples missed a light is too dark and too sure of it at once, and weights learn that.
     crop : edge in pixels of the part that a step looks at, if the image is larger; memory grows with it.
     block : edge in pixels of the blocks that are kept apart.
     every : steps between looks at the blocks that choose.
@@ -57,6 +60,7 @@ class Adaptation:
     rate: float = 1e-4
     only: tuple[str, ...] = ()
     folds: int = 2
+    pool: int = 1
     crop: int = 256
     block: int = 16
     every: int = 10
@@ -67,6 +71,7 @@ class Adaptation:
     def __post_init__(self) -> None:
         for name in ("steps", "folds", "crop", "block", "every", "patience", "probes"):
             _checks.positive_int(name, getattr(self, name))
+        _checks.odd_int("pool", self.pool)
         if not 0 < self.rate < math.inf:
             raise ValueError(f"rate is {self.rate}, expected a number above 0, such as 1e-4.")
         if not 0 <= self.confidence < math.inf:
@@ -192,10 +197,11 @@ def _fit(
     progress: Progress,
 ) -> Adapted:
     checked_variance(frame)
+    frame = pooled(repaired(frame), adaptation.pool)
     step_key, look_key, host_key = jax.random.split(key, 3)
     host = generator(host_key)
     folds = _blocks.folds(frame.size, adaptation.block, adaptation.folds, host)
-    task = task_of(denoiser, repaired(frame), chosen, MonteCarlo(adaptation.probes))
+    task = task_of(denoiser, frame, chosen, MonteCarlo(adaptation.probes))
 
     def look(step: int, weights: Weights) -> _Seen:
         probed = np.asarray(risks(task, weights, look_key), np.float64)
