@@ -307,8 +307,7 @@ def test_patches_cover_the_image():
     assert corners.tolist() == [[0, 0], [8, 0], [12, 0]]
 
 
-FOLDS = adaptation.Adaptation(folds=2)
-SURE = adaptation.Adaptation(steps=40, rate=0.02, folds=1, block=4, every=5, crop=16)
+SURE = adaptation.Adaptation(steps=40, rate=0.02, block=4, every=5, crop=16)
 
 
 @pytest.fixture(scope="module")
@@ -322,10 +321,9 @@ def test_adaptation_lowers_the_true_error(adapted):
     frame, truth, dim, found = adapted
     before, after = (((np.asarray(f(frame)) - truth) ** 2).mean() for f in (dim, found.adapted))
     assert after < 0.2 * before
-    (fit,) = found.fits
-    assert fit.step > 0
+    assert found.step > 0
     assert found.before - found.after > 2 * found.error
-    assert fit.risks[-1] < fit.risks[0]
+    assert found.risks[-1] < found.risks[0]
 
 
 def test_adaptation_follows_its_key_and_can_be_stopped(adapted):
@@ -335,8 +333,8 @@ def test_adaptation_follows_its_key_and_can_be_stopped(adapted):
     other = adaptation.adapt(frame, dim, adaptation=SURE, key=jax.random.key(1))
     assert jax.tree.leaves(other.adapted) != jax.tree.leaves(found.adapted)
     stopped = adaptation.adapt(frame, dim, adaptation=SURE, progress=lambda n, _: n < 7)
-    assert stopped.fits[0].steps.tolist() == [0, 5, 7]
-    np.testing.assert_array_equal(stopped.fits[0].risks[:2], found.fits[0].risks[:2])
+    assert stopped.steps.tolist() == [0, 5, 7]
+    np.testing.assert_array_equal(stopped.risks[:2], found.risks[:2])
 
 
 def test_what_is_right_already_stays(adapted):
@@ -346,7 +344,7 @@ def test_what_is_right_already_stays(adapted):
 
     identity = pd.FunctionDenoiser(jax.tree_util.Partial(lambda w, x: w * x, jnp.float32(1)))
     found = adaptation.adapt(frame, identity, adaptation=dataclasses.replace(SURE, steps=1))
-    assert found.fits[0].step == 0
+    assert found.step == 0
     assert jax.tree.leaves(found.adapted) == [1]
 
 
@@ -383,45 +381,21 @@ def test_a_mixer_is_adapted_by_the_risk_of_the_mix(adapted):
         adaptation.adapt_mixer(frame, BLUR, pd.ClosedForm())
 
 
-def test_folds_apply_weights_where_they_were_not_fitted(adapted):
-    """Each pixel has the weights of the one fold in which its block tells, and the whole is a denoiser."""
-    frame, _, dim, _ = adapted
-    settings = dataclasses.replace(SURE, folds=2, patience=1, steps=10)
-    calls = []
-    found = adaptation.adapt(
-        frame, dim, adaptation=settings, progress=lambda *call: calls.append(call)
-    )
-    assert calls == [(n, 20) for n in range(1, 21)]
-    assert found.before - found.after > 2 * found.error
-    masks = np.asarray(found.adapted.masks)
-    np.testing.assert_array_equal(masks.sum(0), 1)
-    one, two = (
-        Blur(*(np.asarray(leaf)[n] for leaf in jax.tree.leaves(found.adapted.stacked)))
-        for n in range(2)
-    )
-    assert one.gain != two.gain
-    expected = np.where(masks[0] > 0, one(frame), two(frame))
-    np.testing.assert_allclose(
-        jax.jit(lambda d, f: d(f))(found.adapted, frame), expected, rtol=1e-5
-    )
-    with pytest.raises(ValueError, match="adapt with folds=1"):
-        found.adapted(frame_of(0, size=(8, 8))[0])
-    stopped = adaptation.adapt(frame, dim, adaptation=settings, progress=lambda *_: False)
-    assert [fit.steps.tolist() for fit in stopped.fits] == [[0, 1], [0]]
+def test_blocks_hold_what_they_should():
+    kinds = _blocks.kinds((40, 60), 8, np.random.default_rng(0))
+    assert kinds.shape == (5, 8)
+    assert np.bincount(kinds.ravel()).tolist() == [24, 10, 6]
+    values = _blocks.spread(kinds, (40, 60)).astype(float)
+    np.testing.assert_array_equal(_blocks.means(values, kinds.shape), kinds)
 
 
-@pytest.mark.parametrize("count", [1, 3])
-def test_blocks_hold_what_they_should(count):
-    folds = _blocks.folds((40, 60), 8, count, np.random.default_rng(0))
-    assert [kinds.shape for kinds in folds] == [(5, 8)] * count
-    told = np.stack([kinds == _blocks.TELL for kinds in folds])
-    np.testing.assert_array_equal(told.sum(0), 1 if count > 1 else told[0])
-    for kinds in folds:
-        fitting, choosing, telling = np.bincount(kinds.ravel()).tolist()
-        assert fitting > 2 * choosing
-        assert telling in ((6,) if count == 1 else (13, 14))
-    values = _blocks.spread(folds[0], (40, 60)).astype(float)
-    np.testing.assert_array_equal(_blocks.means(values, folds[0].shape), folds[0])
+def test_pooled_variances():
+    """Means over what is inside of 3×3 pixels."""
+    frame, _ = frame_of(0, size=(5, 4))
+    variance = np.random.default_rng(0).random((5, 4, 3)).astype(np.float32)
+    found = np.asarray(adaptation.pooled(frame.replace(variance=variance), 3).variance)
+    np.testing.assert_allclose(found[2, 1], variance[1:4, 0:3].mean((0, 1)), rtol=1e-5)
+    np.testing.assert_allclose(found[0, 3], variance[:2, 2:].mean((0, 1)), rtol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -440,7 +414,7 @@ def test_blocks_hold_what_they_should(count):
         (lambda f: adaptation.Adaptation(rate=-1), "rate is -1"),
         (lambda f: adaptation.Adaptation(confidence=-1), "confidence is -1"),
         (lambda f: adaptation.Adaptation(steps=0), "steps is 0"),
-        (lambda f: adaptation.adapt_mixer(f, BLUR, Constant(0.0), adaptation=FOLDS), "folds is 2"),
+        (lambda f: adaptation.Adaptation(pool=4), "pool is 4"),
     ],
 )
 def test_bad_input_is_refused(call, message):

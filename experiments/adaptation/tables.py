@@ -54,8 +54,8 @@ def adaptation(row: Row) -> str:
     told = row.settings
     kind = told.get("adaptation", "none")
     if kind == "sure":
-        pool = f", variances over {told['adaptation.pool']}²" * (told["adaptation.pool"] > 1)
-        return f"SURE, {told['adaptation.folds']} folds{pool}"
+        pool = told["adaptation.pool"]
+        return "SURE" if pool == 1 else f"SURE, variances over {pool}×{pool}"
     if kind == "post-correct":
         names = {(False, False): "A", (False, True): "B", (True, False): "C", (True, True): "D"}
         setting = names[told["correction.refined"], told["correction.bilateral"]]

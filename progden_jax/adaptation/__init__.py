@@ -5,11 +5,10 @@ Two ways: `post_correct` trains a small network behind the denoiser on two halve
 estimate. What comes out of either can be given to `progden_jax.progressive_denoise`.
 """
 
-from progden_jax.adaptation._folds import CrossFitted
 from progden_jax.adaptation._halves import Halves, WithHalves, halves, split
 from progden_jax.adaptation._pooling import pooled
 from progden_jax.adaptation.by_halves import Corrected, post_correct
-from progden_jax.adaptation.by_sure import Adaptation, Adapted, Fit, adapt, adapt_mixer
+from progden_jax.adaptation.by_sure import Adaptation, Adapted, adapt, adapt_mixer
 from progden_jax.adaptation.correction import SETTINGS, PostCorrected, PostCorrection
 
 __all__ = [
@@ -17,8 +16,6 @@ __all__ = [
     "Adaptation",
     "Adapted",
     "Corrected",
-    "CrossFitted",
-    "Fit",
     "Halves",
     "PostCorrected",
     "PostCorrection",

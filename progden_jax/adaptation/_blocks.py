@@ -8,19 +8,14 @@ from jaxtyping import Int
 Kinds = Int[np.ndarray, "rows columns"]
 """Of every block what it is for: FIT, CHOOSE or TELL."""
 
-FIT, CHOOSE, TELL = range(3)
+KINDS = FIT, CHOOSE, TELL = range(3)
 
-_TOLD = 0.15
-"""Share that tells the gain, of an image in one fold."""
-
-_CHOOSING = 0.3
-"""Share that chooses, of the blocks that do not tell."""
+_TOLD, _CHOOSING = 0.15, 0.25
+"""Shares of the blocks."""
 
 
-def folds(size: tuple[int, int], block: int, count: int, host: np.random.Generator) -> list[Kinds]:
-    """The kinds of all blocks, for each fold; every block tells in one, or few blocks where there is one.
-
-    Blocks shrink until there are 16 or so.
+def kinds(size: tuple[int, int], block: int, host: np.random.Generator) -> Kinds:
+    """The kinds of all blocks, at random; blocks shrink until there are 16 or so.
 
     Raises
     ------
@@ -30,21 +25,14 @@ def folds(size: tuple[int, int], block: int, count: int, host: np.random.Generat
     while block > 1 and math.prod(-(-n // block) for n in size) < 16:
         block //= 2
     shape = (-(-size[0] // block), -(-size[1] // block))
-    total = math.prod(shape)
-    if total < 3 * count:
+    count = math.prod(shape)
+    if count < 3:
         raise ValueError(
             f"the frame has {size[0]}×{size[1]} pixels, too few to fit weights to some and judge by others."
         )
-    order = host.permutation(total)
-    told = np.array_split(order, count) if count > 1 else [order[: max(round(_TOLD * total), 1)]]
-    found = []
-    for numbers in told:
-        others = host.permutation(np.setdiff1d(order, numbers))
-        kinds = np.full(total, FIT)
-        kinds[numbers] = TELL
-        kinds[others[: max(round(_CHOOSING * len(others)), 1)]] = CHOOSE
-        found.append(kinds.reshape(shape))
-    return found
+    telling, choosing = (max(round(share * count), 1) for share in (_TOLD, _CHOOSING))
+    found = np.repeat([FIT, CHOOSE, TELL], [count - choosing - telling, choosing, telling])
+    return host.permutation(found).reshape(shape)
 
 
 def spread(blocks: np.ndarray, size: tuple[int, int]) -> np.ndarray:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import Any, cast
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -49,6 +50,11 @@ class Task:
     def first(self) -> Weights:
         """The weights to start from."""
         return _leaves.taken(self.denoiser, self.chosen)
+
+    def only_in(self, pixels: np.ndarray) -> "Task":
+        """The same with no loss elsewhere; `pixels` is (H, W)."""
+        scale = jnp.where(jnp.asarray(pixels)[..., None], self.scale, 0)
+        return dataclasses.replace(self, scale=scale)
 
     def with_weights(self, weights: Weights) -> Any:
         """The denoiser that has them."""

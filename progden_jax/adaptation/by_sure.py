@@ -2,19 +2,16 @@
 
 An estimate that is made small is no longer unbiased: weights come to follow the noise that it rests on. So
 the image is cut into blocks of three kinds, drawn at random. The loss is taken in the first alone, where
-to stop is chosen in the second, and the third, that neither has seen, tell the gain; the last two with probes
-of their own, the same ones at all times, so that only the weights differ. With several folds the third are
-also the only pixels that the weights are then applied to.
+to stop is chosen in the second, and the gain is told from the third; the last two with probes of their own,
+the same ones at all times, so that only the weights differ.
 """
 
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -22,7 +19,6 @@ from progden_jax import _checks
 from progden_jax._program import checked_variance
 from progden_jax.adaptation import _blocks, _leaves
 from progden_jax.adaptation._descent import Weights, descent, risks, task_of
-from progden_jax.adaptation._folds import cross_fitted
 from progden_jax.adaptation._mixed import Mixed
 from progden_jax.adaptation._pooling import pooled
 from progden_jax.adaptation._running import Progress, generator
@@ -39,12 +35,10 @@ class Adaptation:
 
     Parameters
     ----------
-    steps : of Adam, at most, per fold.
+    steps : of Adam, at most.
     rate : its learning rate.
     only : names of layers or attributes to change, such as ("dec_conv1a", "dec_conv0") of a U-Net;
         none stands for all weights.
-    folds : so many times weights are fitted, each time without a share of the blocks, where they are then
-        applied. 1: once, and applied everywhere: SURE of what comes out is biased low.
     pool : odd edge in pixels of the window that variances are averaged over for the fit; 1: as they are. A
         pixel whose samples missed a light is too dark and too sure of it at once, and weights learn that.
     crop : edge in pixels of the part that a step looks at, if the image is larger; memory grows with it.
@@ -59,7 +53,6 @@ class Adaptation:
     steps: int = 100
     rate: float = 1e-4
     only: tuple[str, ...] = ()
-    folds: int = 2
     pool: int = 1
     crop: int = 256
     block: int = 16
@@ -69,7 +62,7 @@ class Adaptation:
     probes: int = 1
 
     def __post_init__(self) -> None:
-        for name in ("steps", "folds", "crop", "block", "every", "patience", "probes"):
+        for name in ("steps", "crop", "block", "every", "patience", "probes"):
             _checks.positive_int(name, getattr(self, name))
         _checks.odd_int("pool", self.pool)
         if not 0 < self.rate < math.inf:
@@ -80,38 +73,27 @@ class Adaptation:
             )
 
 
-class Fit(NamedTuple):
-    """How the weights of one fold were found.
-
-    Attributes
-    ----------
-    step : after which they were, 0: unchanged.
-    steps : at which the blocks that choose were looked at,
-    risks : and the risk there, with the advantage of the chosen one.
-    """
-
-    step: int
-    steps: Int[np.ndarray, " n"]
-    risks: Float[np.ndarray, " n"]
-
-
 class Adapted(NamedTuple):
     """What `adapt` gives; risks are means of SURE / (y² + 0.01 + σ²), y the denoised image before.
 
     Attributes
     ----------
-    adapted : what was given with the weights that were best, those before where none was surely better; with
-        several folds a `CrossFitted` of them.
+    adapted : the denoiser, or the mixer, with the weights that were best; those before where none was surely
+        better.
+    step : after which they were found, 0: unchanged.
     before, after : risk where nothing was fitted or chosen; a single value is noisy.
     error : standard error of `before` minus `after`, over blocks.
-    fits : one per fold.
+    steps : at which the blocks that choose were looked at,
+    risks : and the risk there, with the advantage of the chosen one.
     """
 
     adapted: Any
+    step: int
     before: float
     after: float
     error: float
-    fits: tuple[Fit, ...]
+    steps: Int[np.ndarray, " n"]
+    risks: Float[np.ndarray, " n"]
 
 
 def adapt(
@@ -124,9 +106,8 @@ def adapt(
 ) -> Adapted:
     """The denoiser with weights fitted to this render by Stein's estimate of its error; no reference needed.
 
-    What comes out is a denoiser for this frame, to be given to `progressive_denoise`; with one fold it is of
-    the same kind as before, serves other frames too and can be saved. The same key gives the same result on
-    the same machine. Bad pixels are repaired first.
+    What comes out is a denoiser of the same kind, to be given to `progressive_denoise` or saved. The same key
+    gives the same result on the same machine. Bad pixels are repaired first.
 
     Parameters
     ----------
@@ -167,19 +148,14 @@ def adapt_mixer(
     """The mixer with weights fitted to this render by SURE of the mix; the denoiser stays as it is.
 
     How α follows x counts in the mix's divergence, but for what reaches it through the estimated
-    divergence of the denoiser. All else as for `adapt`; ``only`` picks among the mixer's layers, and None
-    stands for ``Adaptation(folds=1)``.
+    divergence of the denoiser. All else as for `adapt`; ``only`` picks among the mixer's layers.
 
     Raises
     ------
     ValueError
-        If the mixer has no weights, as the closed form, or there are several folds; see also `adapt`.
+        If the mixer has no weights, as the closed form; see also `adapt`.
     """
-    adaptation = Adaptation(folds=1) if adaptation is None else adaptation
-    if adaptation.folds > 1:
-        raise ValueError(
-            f"folds is {adaptation.folds}, and a mixer is fitted in one: no estimate rests on the mix."
-        )
+    adaptation = Adaptation() if adaptation is None else adaptation
     mix_key, fit_key = jax.random.split(jax.random.key(0) if key is None else key)
     mixed = Mixed(passable(denoiser), mixer, mix_key)
     before = len(jax.tree.leaves(mixed.denoiser))
@@ -200,75 +176,20 @@ def _fit(
     frame = pooled(repaired(frame), adaptation.pool)
     step_key, look_key, host_key = jax.random.split(key, 3)
     host = generator(host_key)
-    folds = _blocks.folds(frame.size, adaptation.block, adaptation.folds, host)
+    kinds = _blocks.kinds(frame.size, adaptation.block, host)
+    fitting, choosing, telling = (kinds == kind for kind in _blocks.KINDS)
     task = task_of(denoiser, frame, chosen, MonteCarlo(adaptation.probes))
 
     def look(step: int, weights: Weights) -> _Seen:
         probed = np.asarray(risks(task, weights, look_key), np.float64)
-        return _Seen(step, weights, _blocks.means(probed.mean(-1), folds[0].shape))
+        return _Seen(step, weights, _blocks.means(probed.mean(-1), kinds.shape))
 
-    start = look(0, task.first)
-    follow = _Follower(progress, adaptation)
-    found: list[tuple[_Seen, Fit]] = []
-    for number, kinds in enumerate(folds):
-        fitted = jnp.asarray(_blocks.spread(kinds == _blocks.FIT, frame.size))[..., None]
-        part = dataclasses.replace(task, scale=jnp.where(fitted, task.scale, 0))
-        drawn = jax.random.fold_in(step_key, number)
-        steps = descent(part, adaptation.crop, adaptation.rate, drawn, host)
-        found.append(_best(start, steps, look, kinds == _blocks.CHOOSE, adaptation, follow))
-        follow.next_fold()
-    best, fits = zip(*found, strict=True)
-    told = [kinds == _blocks.TELL for kinds in folds]
-    before = np.concatenate([start.risks[here] for here in told])
-    after = np.concatenate([seen.risks[here] for seen, here in zip(best, told, strict=True)])
-    fitted = [task.with_weights(seen.weights) for seen in best]
-    masks = [_blocks.spread(here, frame.size) for here in told]
-    return Adapted(
-        fitted[0] if len(fitted) == 1 else cross_fitted(fitted, masks),
-        before=float(before.mean()),
-        after=float(after.mean()),
-        error=_blocks.mean_and_error(before - after)[1],
-        fits=fits,
-    )
-
-
-class _Seen(NamedTuple):
-    """The weights after a step, and the risk of every block with them."""
-
-    step: int
-    weights: Weights
-    risks: np.ndarray
-
-
-class _Follower:
-    """Tells of the steps of all folds, and remembers that it was told to stop."""
-
-    def __init__(self, progress: Progress, adaptation: Adaptation) -> None:
-        self.stopped = False
-        self._progress, self._per_fold = progress, adaptation.steps
-        self._total, self._before = adaptation.folds * adaptation.steps, 0
-
-    def __call__(self, step: int) -> bool:
-        self.stopped |= self._progress(self._before + step, self._total) is False
-        return self.stopped
-
-    def next_fold(self) -> None:
-        self._before += self._per_fold
-
-
-def _best(
-    start: _Seen,
-    descent: Iterator[Weights],
-    look: Callable[[int, Weights], _Seen],
-    choosing: np.ndarray,
-    adaptation: Adaptation,
-    follow: _Follower,
-) -> tuple[_Seen, Fit]:
-    """The weights of least risk in the blocks that choose, if it is surely less."""
-    best, looks = start, [(0, start.risks[choosing].mean())]
-    most = 0 if follow.stopped else adaptation.steps
-    for step, weights in enumerate(itertools.islice(descent, most), 1):
-        stopped = follow(step)
+    start = best = look(0, task.first)
+    looks = [(0, start.risks[choosing].mean())]
+    part = task.only_in(_blocks.spread(fitting, frame.size))
+    steps = descent(part, adaptation.crop, adaptation.rate, step_key, host)
+    for step, weights in enumerate(itertools.islice(steps, adaptation.steps), 1):
+        stopped = progress(step, adaptation.steps) is False
         if step % adaptation.every and step < adaptation.steps and not stopped:
             continue
         seen = look(step, weights)
@@ -280,5 +201,21 @@ def _best(
     gain, error = _blocks.mean_and_error((start.risks - best.risks)[choosing])
     if not gain > adaptation.confidence * error:
         best = start
-    steps, values = zip(*looks, strict=True)
-    return best, Fit(best.step, np.asarray(steps), np.asarray(values))
+    numbers, values = zip(*looks, strict=True)
+    return Adapted(
+        task.with_weights(best.weights),
+        best.step,
+        before=float(start.risks[telling].mean()),
+        after=float(best.risks[telling].mean()),
+        error=_blocks.mean_and_error((start.risks - best.risks)[telling])[1],
+        steps=np.asarray(numbers),
+        risks=np.asarray(values),
+    )
+
+
+class _Seen(NamedTuple):
+    """The weights after a step, and the risk of every block with them."""
+
+    step: int
+    weights: Weights
+    risks: np.ndarray

@@ -54,7 +54,7 @@ class AdaptOptions:
     adapt_steps: Annotated[
         int | None,
         Parameter(
-            help="Steps of fitting [default: 100 per fold at most; 20 epochs of --post-correct, at least 80]."
+            help="Steps of fitting [default: 100 at most; 20 epochs of --post-correct, at least 80]."
         ),
     ] = None
     sequence: Annotated[
@@ -184,9 +184,13 @@ def adapted(
             key=key,
             progress=lambda done, total: progress(done, total, of="the adaptation"),
         )
-        chosen = [fit.step for fit in found.fits]
-        told = {"steps": chosen, "risk_before": found.before, "risk_after": found.after}
-        outcome.adaptation = {"kind": "sure", **told, "risk_error": found.error}
+        outcome.adaptation = {
+            "kind": "sure",
+            "steps": found.step,
+            "risk_before": found.before,
+            "risk_after": found.after,
+            "risk_error": found.error,
+        }
         denoiser = found.adapted
     elif options.post_correct:
         split_key, fit_key = jax.random.split(key)
@@ -225,6 +229,6 @@ def described(found: dict[str, Any]) -> str:
     """What was done, for people."""
     if found["kind"] == "post-correct":
         return f"post-corrected in {found['steps']} steps"
-    if not any(found["steps"]):
+    if not found["steps"]:
         return "not adapted, as no gain was sure"
-    return f"adapted in {' and '.join(map(str, found['steps']))} steps"
+    return f"adapted in {found['steps']} steps"
