@@ -11,9 +11,9 @@ from conftest import drawn
 
 import progden_jax as pd
 from progden_jax import adaptation
-from progden_jax.adaptation import by_sure, combination
+from progden_jax.adaptation import _blocks, combination
 
-SMALL = adaptation.PostCorrection(window=3, layers=2, width=4, patch=8, epochs=1, min_steps=1)
+SMALL = adaptation.PostCorrection(window=3, layers=2, width=4, patch=8, steps=1)
 
 
 @functools.partial(jax.tree_util.register_dataclass, data_fields=("gain", "rest"), meta_fields=())
@@ -246,7 +246,7 @@ def corrected():
     """A biased denoiser, too bright by half, corrected with few small steps."""
     frame, truth = frame_of(2, sigma=0.1)
     bright = Blur(jnp.float32(1), jnp.float32(0.5))
-    settings = dataclasses.replace(SMALL, min_steps=30, rate=0.01)
+    settings = dataclasses.replace(SMALL, steps=30, rate=0.01)
     halves = adaptation.split(frame, jax.random.key(5))
     return (
         halves,
@@ -301,7 +301,7 @@ def test_post_correction_goes_on_from_weights_and_follows_its_key(corrected):
 
 
 def test_patches_cover_the_image():
-    from progden_jax.adaptation.correction import _corners
+    from progden_jax.adaptation.by_halves import _corners
 
     corners = _corners((20, 7), 8)
     assert corners.tolist() == [[0, 0], [8, 0], [12, 0]]
@@ -382,11 +382,20 @@ def test_a_mixer_is_adapted_by_the_risk_of_the_mix(adapted):
 
 
 def test_blocks_hold_what_they_should():
-    kinds = by_sure._kinds((40, 60), 8, np.random.default_rng(0))
+    kinds = _blocks.kinds((40, 60), 8, np.random.default_rng(0))
     assert kinds.shape == (5, 8)
     assert np.bincount(kinds.ravel()).tolist() == [24, 10, 6]
-    values = by_sure._spread(kinds, (40, 60)).astype(float)
-    np.testing.assert_array_equal(by_sure._block_means(values, kinds.shape), kinds)
+    values = _blocks.spread(kinds, (40, 60)).astype(float)
+    np.testing.assert_array_equal(_blocks.means(values, kinds.shape), kinds)
+
+
+def test_pooled_variances():
+    """Means over what is inside of 3×3 pixels."""
+    frame, _ = frame_of(0, size=(5, 4))
+    variance = np.random.default_rng(0).random((5, 4, 3)).astype(np.float32)
+    found = np.asarray(adaptation.pooled(frame.replace(variance=variance), 3).variance)
+    np.testing.assert_allclose(found[2, 1], variance[1:4, 0:3].mean((0, 1)), rtol=1e-5)
+    np.testing.assert_allclose(found[0, 3], variance[:2, 2:].mean((0, 1)), rtol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -405,6 +414,7 @@ def test_blocks_hold_what_they_should():
         (lambda f: adaptation.Adaptation(rate=-1), "rate is -1"),
         (lambda f: adaptation.Adaptation(confidence=-1), "confidence is -1"),
         (lambda f: adaptation.Adaptation(steps=0), "steps is 0"),
+        (lambda f: adaptation.Adaptation(pool=4), "pool is 4"),
     ],
 )
 def test_bad_input_is_refused(call, message):

@@ -806,6 +806,15 @@ CONTRADICTIONS = [
     "--clean-aux --prefilter",
     "--prefilter --denoiser oidn-hdr-alb-nrm",
     "--variance-of std --variance-from b.exr",
+    "--adapt --post-correct",
+    "--adapt --denoiser nfor",
+    "--adapt --max-memory 1GiB",
+    "--adapt --sequence",
+    "--adapt --adapt-steps 0",
+    "--adapt-steps 5",
+    "--halves a.exr b.exr",
+    "--post-correct --halves a.exr",
+    "--post-correct --halves a.exr b.exr --variance-from a.exr b.exr",
 ]
 USAGE |= {c: ["denoise", "{in}", "-o", "{out}", *c.split()] for c in CONTRADICTIONS}
 

@@ -23,7 +23,7 @@ from conftest import counting_compilations
 from evaluation_runs import REFERENCE, TOY, Remembers, write_series
 
 import progden_jax as pd
-from progden_jax import evaluation, metrics
+from progden_jax import adaptation, evaluation, metrics
 from progden_jax.cli import main
 from progden_jax.denoisers import FunctionDenoiser
 from progden_jax.evaluation import exports, statistics
@@ -121,6 +121,34 @@ def test_rows_are_of_what_the_pipeline_gives(run, renders):
     assert all((r.seconds is None) == (r.memory is None) for r in rows)
     oracle, mixed = (row_of(rows, f"{m} {label}").rmse for m in ("oracle", "mix"))
     assert oracle < mixed
+
+
+def test_a_denoiser_is_adapted_to_each_render(renders, tmp_path):
+    """By its own settings, which are part of the row; what cannot be adapted fails alone."""
+    small = {"window": 3, "layers": 2, "width": 4, "patch": 8, "steps": 2}
+    base = {f"correction.{name}": value for name, value in small.items()}
+    plan = plan_of(renders, ["denoised", "mix"], adaptation="post-correct", seed=3, **base)
+    assert evaluation.carry_out(plan, tmp_path, report=Remembers()) == (8, 0, 0)
+    assert evaluation.carry_out(plan, tmp_path, report=Remembers()) == (0, 8, 0)
+    frame = pd.read_exr(renders / "scene1_000004spp.exr")
+    split_key, fit_key = jax.random.split(jax.random.fold_in(jax.random.key(3), 1))
+    found = adaptation.post_correct(
+        adaptation.split(frame, split_key),
+        load_denoiser(TOY, "highest"),
+        correction=adaptation.PostCorrection(**small),
+        key=fit_key,
+    )
+    reference = pd.read_exr(renders / f"scene1_{REFERENCE:06}spp.exr")
+    method, _ = plan.methods[0]
+    row = row_of(evaluation.rows(tmp_path), method)
+    assert row.rmse == pytest.approx(float(metrics.rmse(found.image, reference.color)), rel=1e-4)
+    assert row.settings["adaptation"] == "post-correct"
+    assert row.settings["correction.steps"] == 2
+    assert row.settings["seed"] == 3
+    report = Remembers()
+    plan = plan_of(renders, ["denoised"], adaptation="sure")
+    assert evaluation.carry_out(plan, tmp_path / "sure", report=report).failed == 4
+    assert "has no weights to adapt" in report.failures[0]
 
 
 def known_of(result, frame):

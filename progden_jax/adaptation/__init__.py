@@ -5,15 +5,11 @@ Two ways: `post_correct` trains a small network behind the denoiser on two halve
 estimate. What comes out of either can be given to `progden_jax.progressive_denoise`.
 """
 
-from progden_jax.adaptation._halves import Halves, halves, split
+from progden_jax.adaptation._halves import Halves, WithHalves, halves, split
+from progden_jax.adaptation._pooling import pooled
+from progden_jax.adaptation.by_halves import Corrected, post_correct
 from progden_jax.adaptation.by_sure import Adaptation, Adapted, adapt, adapt_mixer
-from progden_jax.adaptation.correction import (
-    SETTINGS,
-    Corrected,
-    PostCorrected,
-    PostCorrection,
-    post_correct,
-)
+from progden_jax.adaptation.correction import SETTINGS, PostCorrected, PostCorrection
 
 __all__ = [
     "SETTINGS",
@@ -23,9 +19,11 @@ __all__ = [
     "Halves",
     "PostCorrected",
     "PostCorrection",
+    "WithHalves",
     "adapt",
     "adapt_mixer",
     "halves",
+    "pooled",
     "post_correct",
     "split",
 ]

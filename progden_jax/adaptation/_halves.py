@@ -1,12 +1,14 @@
 """Dual buffers: two independent renders of one view, as one frame and the difference between them."""
 
-from typing import NamedTuple, cast
+import dataclasses
+from typing import Any, NamedTuple, cast
 
 import jax
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from progden_jax import _checks
 from progden_jax._numeric import safe_sqrt
+from progden_jax.denoisers._base import Bound
 from progden_jax.divergence import _random
 from progden_jax.frame import Frame, repaired
 
@@ -40,11 +42,15 @@ def halves(a: Frame, b: Frame) -> Halves:
     Raises
     ------
     ValueError
-        If a frame is no single image, or the sizes differ.
+        If a frame is no single image, or the sizes or samples per pixel differ.
     """
     for name, color in (("a.color", a.color), ("b.color", b.color)):
         _checks.image(name, color)
     _checks.same_shape("b.color", b.color, "a.color", a.color)
+    if a.spp is not None and b.spp is not None and a.spp != b.spp:
+        raise ValueError(
+            f"the halves have {float(a.spp):g} and {float(b.spp):g} samples per pixel, expected equal ones."
+        )
     a, b = repaired(a), repaired(b)
     mean, difference = {}, {}
     for name in _DIFFERING:
@@ -84,6 +90,35 @@ def split(frame: Frame, key: jax.Array) -> Halves:
     frame = repaired(frame)
     noise = safe_sqrt(cast(Array, frame.variance)) * _random.normal(key, 0, frame.color)
     return Halves(frame, {"color": noise})
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class WithHalves:
+    """A denoiser that makes use of two independent halves, such as `progden_jax.denoisers.NFOR`.
+
+    Parameters
+    ----------
+    denoiser : its ``bind(frame, halves=...)`` takes their colours.
+    difference : (H, W, 3), (a − b)/2, see `Halves`; a constant in derivatives.
+    """
+
+    denoiser: Any
+    difference: Float[Array, "h w 3"]
+
+    @property
+    def name(self) -> str | None:
+        """The denoiser's, by which its mixer is found."""
+        return getattr(self.denoiser, "name", None)
+
+    def __call__(self, frame: Frame) -> Float[Array, "h w 3"]:
+        """The denoised image, (H, W, 3) linear radiance."""
+        return self.bind(frame)(frame.color)
+
+    def bind(self, frame: Frame) -> Bound:
+        """f with y = f(x) for the frame that the halves make up."""
+        a, b = separate(frame, {"color": self.difference})
+        return self.denoiser.bind(frame, halves=(a.color, b.color))
 
 
 def separate(frame: Frame, difference: dict[str, Array]) -> tuple[Frame, Frame]:

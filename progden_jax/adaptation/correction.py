@@ -1,12 +1,10 @@
-"""Self-supervised post-correction: a small network learns from two halves of one render to repair a
-denoiser."""
+"""A denoiser followed by a small network that repairs it (Back et al. 2022); `post_correct` fits that."""
 
 import dataclasses
 import functools
 import itertools
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,17 +14,17 @@ from jaxtyping import Array, Float
 from progden_jax import _checks
 from progden_jax._convolution import same_convolution
 from progden_jax.adaptation import combination
-from progden_jax.adaptation._halves import Halves, separate
-from progden_jax.adaptation._running import OPTIMIZER, Progress, descended, generator
+from progden_jax.adaptation._halves import separate
 from progden_jax.denoisers import Denoiser
-from progden_jax.denoisers._base import Bound, passable
+from progden_jax.denoisers._base import Bound
 from progden_jax.frame import Frame
 
 Params = Mapping[str, Mapping[str, Array]]
 """Layer -> kernel and bias."""
 
 _SCALES, _BANDWIDTHS = 9, len(combination.GUIDES)
-_MAX_RATE = 0.01
+_MIN_STEPS = 80
+"""20 epochs of a 1024×1024 image have as many; a small image would learn next to nothing from its 20."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,8 +39,7 @@ class PostCorrection:
     layers, width : 3×3 convolutions, the last one included, and the channels between them.
     epochs : passes over the image's patches.
     patch, batch : width of the patches in pixels, at most the image's, and how many make a step.
-    min_steps : more epochs are made until there are so many steps: 20 of a 1024×1024 image have 80, while a
-        small image would learn next to nothing from its 20.
+    steps : instead of epochs; None: those that the epochs have, but at least 80.
     rate : learning rate of Adam; None: 0.01 times the render's RMS noise by its halves, at most 0.01.
     """
 
@@ -54,13 +51,15 @@ class PostCorrection:
     epochs: int = 20
     patch: int = 128
     batch: int = 16
-    min_steps: int = 80
+    steps: int | None = None
     rate: float | None = None
 
     def __post_init__(self) -> None:
         _checks.odd_int("window", self.window)
-        for name in ("layers", "width", "epochs", "patch", "batch", "min_steps"):
+        for name in ("layers", "width", "epochs", "patch", "batch"):
             _checks.positive_int(name, getattr(self, name))
+        if self.steps is not None:
+            _checks.positive_int("steps", self.steps)
         if self.rate is not None and not 0 < self.rate < math.inf:
             raise ValueError(f"rate is {self.rate}, expected a number above 0, such as 1e-3.")
 
@@ -69,6 +68,10 @@ class PostCorrection:
         """Channels of the last layer: 15 by the paper's defaults."""
         weights = _BANDWIDTHS + 1 if self.bilateral else self.window**2
         return weights + (_SCALES if self.refined else 0)
+
+    def count(self, per_epoch: int) -> int:
+        """Steps to make, where an epoch has so many."""
+        return max(self.epochs * per_epoch, _MIN_STEPS) if self.steps is None else self.steps
 
     def init(self, key: jax.Array) -> dict[str, dict[str, Array]]:
         """Weights to start from: Glorot and Bengio's uniform, zero biases."""
@@ -146,6 +149,11 @@ class PostCorrected:
     difference: dict[str, Array]
     correction: PostCorrection
 
+    @property
+    def name(self) -> str | None:
+        """The denoiser's, by which its mixer is found."""
+        return getattr(self.denoiser, "name", None)
+
     def __call__(self, frame: Frame) -> Float[Array, "h w 3"]:
         """The corrected image, (H, W, 3) linear radiance."""
         return self.bind(frame)(frame.color)
@@ -163,149 +171,3 @@ class PostCorrected:
             return (parts[0] + parts[1]) / 2
 
         return f
-
-
-class Corrected(NamedTuple):
-    """What `post_correct` gives.
-
-    Attributes
-    ----------
-    image : (H, W, 3) the corrected image.
-    denoiser : the same as something that `progressive_denoise` takes for `frame`.
-    frame : the mean of both halves.
-    losses : of every step, Eq. 9 over its patches.
-    """
-
-    image: Float[Array, "h w 3"]
-    denoiser: PostCorrected
-    frame: Frame
-    losses: Float[np.ndarray, " steps"]
-
-
-def post_correct(
-    halves: Halves,
-    denoiser: Denoiser,
-    *,
-    correction: PostCorrection | None = None,
-    start: Params | None = None,
-    key: jax.Array | None = None,
-    progress: Progress = lambda done, total: None,
-) -> Corrected:
-    """The denoised image, corrected by a network that was fitted to this render alone.
-
-    The same key gives the same result.
-
-    Parameters
-    ----------
-    halves : see `halves` for two renders, `split` for one.
-    denoiser : of each half.
-    correction : what is fitted and how; None: the paper's, `SETTINGS` has its ablation.
-    start : weights to start from, such as ``corrected.denoiser.params`` of the previous frame.
-    key : of the first weights and the order of patches; None stands for ``jax.random.key(0)``.
-    progress : called with (done, total) steps; if it returns False, the weights stay as they are then.
-
-    Raises
-    ------
-    ValueError
-        If the frame lacks what the denoiser takes, or the weights are not the correction's.
-
-    Notes
-    -----
-    Back et al. 2022. A step takes about 3·window² passes over 13 planes of its patches; memory does
-    not grow with the window.
-    """
-    correction = PostCorrection() if correction is None else correction
-    key = jax.random.key(0) if key is None else key
-    weights_key, order_key = jax.random.split(key)
-    params = _init(correction, weights_key) if start is None else _checked(correction, start)
-    data = _examples(passable(denoiser), halves)
-    size = halves.frame.size
-    corners = _corners(size, correction.patch)
-    batch = min(correction.batch, len(corners))
-    per_epoch = -(-len(corners) // batch)
-    total = max(correction.epochs * per_epoch, correction.min_steps)
-    rate = correction.rate
-    if rate is None:
-        rate = min(0.01 * float(jnp.sqrt(jnp.mean(halves.difference["color"] ** 2))), _MAX_RATE)
-    patch = (min(correction.patch, size[0]), min(correction.patch, size[1]))
-    optimizer = OPTIMIZER.init(params)
-    order = generator(order_key)
-    losses: list[float] = []
-    shuffled = corners
-    for step in range(total):
-        if step % per_epoch == 0:
-            shuffled = np.resize(order.permutation(corners), (per_epoch * batch, 2))
-        chosen = shuffled[(step % per_epoch) * batch :][:batch]
-        params, optimizer, loss = _step(correction, patch, params, optimizer, data, chosen, rate)
-        losses.append(float(loss))
-        if progress(step + 1, total) is False:
-            break
-    corrected = PostCorrected(passable(denoiser), params, halves.difference, correction)
-    image = _corrected(correction, params, data["guides"])
-    return Corrected(image, corrected, halves.frame, np.asarray(losses))
-
-
-_init = jax.jit(PostCorrection.init, static_argnums=0)
-
-
-def _checked(correction: PostCorrection, params: Params) -> Params:
-    expected = jax.eval_shape(correction.init, jax.random.key(0))
-    if jax.tree.map(jnp.shape, params) != jax.tree.map(jnp.shape, expected):
-        raise ValueError(
-            "start holds weights of other shapes than the correction's: give those of a correction with the "
-            "same window, layers, width and setting."
-        )
-    return params
-
-
-def _corners(size: tuple[int, int], patch: int) -> np.ndarray:
-    """Rows and columns where patches begin that cover the image, the last ones moved inside."""
-    starts = [[min(s, max(n - patch, 0)) for s in range(0, n, patch)] for n in size]
-    return np.asarray([(row, column) for row in starts[0] for column in starts[1]], np.int32)
-
-
-@jax.jit
-def _examples(denoiser: Denoiser, halves: Halves) -> dict[str, Array]:
-    """Of each half the guides, and of the other half what Eq. 8 compares with and divides by."""
-    denoised = [(half, denoiser.bind(half)(half.color)) for half in halves.both()]
-    guides = [combination.guides_of(half, z) for half, z in denoised]
-    targets = [half.color for half, _ in reversed(denoised)]
-    norms = [z.mean(-1, keepdims=True) ** 2 + 0.01 for _, z in reversed(denoised)]
-    return {n: jnp.stack(v) for n, v in (("guides", guides), ("target", targets), ("norm", norms))}
-
-
-def loss(
-    correction: PostCorrection, params: Params, examples: Mapping[str, Float[Array, "n h w c"]]
-) -> Float[Array, ""]:
-    """Mean of (μ̂ − y')²/(z̄'² + 0.01), the primed ones of the other half (Back et al. 2022, Eqs. 8 and 9).
-
-    A half's noise is independent of the other's, so that this is the relative error of μ̂ and what does not
-    depend on the weights.
-    """
-    corrected = jax.vmap(functools.partial(correction.apply, params))(examples["guides"])
-    return ((corrected - examples["target"]) ** 2 / examples["norm"]).mean()
-
-
-@functools.partial(jax.jit, static_argnums=(0, 1))
-def _step(
-    correction: PostCorrection,
-    patch: tuple[int, int],
-    params: Params,
-    optimizer: Any,
-    data: Mapping[str, Array],
-    corners: Array,
-    rate: Array,
-) -> tuple[Params, Any, Array]:
-    def cut(array: Array, corner: Array) -> Array:
-        start = (0, corner[0], corner[1], 0)
-        return jax.lax.dynamic_slice(array, start, (2, *patch, array.shape[-1]))
-
-    picked = {n: jax.vmap(cut, (None, 0))(array, corners) for n, array in data.items()}
-    examples = {n: array.reshape(-1, *array.shape[2:]) for n, array in picked.items()}
-    value, gradient = jax.value_and_grad(functools.partial(loss, correction))(params, examples)
-    return *descended(params, optimizer, gradient, rate), value
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _corrected(correction: PostCorrection, params: Params, guides: Array) -> Array:
-    return jax.vmap(functools.partial(correction.apply, params))(guides).mean(0)

@@ -2,10 +2,10 @@
 
 import contextlib
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, Protocol, cast
 
 import jax
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 import progden_jax as pd
 from progden_jax import memory, mixers
 from progden_jax.batch import Once, Size, canvas_of, shared_canvases
+from progden_jax.cli._adaptation import AdaptOptions, Handed, adapted, described, read_halves
 from progden_jax.cli._compare import Scores, compare
 from progden_jax.cli._options import (
     SAVE_ALWAYS,
@@ -37,6 +38,7 @@ class Settings:
 
     read: ReadOptions
     network: NetworkOptions
+    adaptation: AdaptOptions
     estimate: EstimateOptions
     cost: CostOptions
     save: tuple[str, ...] = ()
@@ -46,6 +48,8 @@ class Settings:
     """What images are computed at, by their own canvas."""
     first_of: Once = field(default_factory=Once)
     """So that a program is compiled by one thread."""
+    handed: Handed = field(default_factory=Handed)
+    """From one frame of a sequence to the next."""
 
 
 @dataclass
@@ -63,6 +67,7 @@ class Outcome:
     variance: str | None = None
     denoiser: str | None = None
     auxiliary: tuple[str, ...] = ()
+    adaptation: dict[str, Any] | None = None
     method: str | None = None
     mixer: str | None = None
     mean_alpha: float | None = None
@@ -81,6 +86,8 @@ class Outcome:
         if self.spp is not None:
             facts.append(f"{self.spp:g} spp")
         facts.append(f"{self.denoiser} ({' + '.join(('colour', *self.auxiliary))})")
+        if self.adaptation is not None:
+            facts.append(described(self.adaptation))
         if self.mean_alpha is None:
             facts.append("denoised plainly")
         else:
@@ -109,14 +116,16 @@ class _Images(NamedTuple):
     maps: dict[str, np.ndarray]
 
 
-Progress = Callable[[int, int], None]
-"""Called with how much of something long is done, and of how much."""
+class Progress(Protocol):
+    """Told how much of something long is done, of how much, and of what if not the exact divergence."""
+
+    def __call__(self, done: int, total: int, of: str = ...) -> None: ...
 
 
 def process(item: Item, settings: Settings, outcome: Outcome, progress: Progress) -> None:
     """Denoise one file, filling in `outcome` as things become known.
 
-    `progress` follows an exact divergence, which may take an hour.
+    `progress` follows an adaptation, and an exact divergence, which may take an hour.
 
     Raises
     ------
@@ -130,11 +139,20 @@ def process(item: Item, settings: Settings, outcome: Outcome, progress: Progress
     outcome.spp, outcome.variance = info.spp, info.variance
     outcome.warnings += info.warnings
     outcome.notes += info.notes
+    halves = None
+    if item.halves:
+        halves = read_halves(item, frame, read, outcome)
+        frame = halves.frame
     reference = None if item.reference is None else _reference(item, frame, outcome)
     frame = _with_usable_variance(frame, info, outcome)
     frame, denoiser = settings.network.load(frame)
     outcome.denoiser = denoiser.name
     outcome.auxiliary = tuple(n for n in denoiser.inputs if getattr(frame, n) is not None)
+    # Other numbers than the probes of the divergence.
+    key = jax.random.fold_in(jax.random.key(settings.estimate.seed), 1)
+    denoiser = adapted(
+        frame, denoiser, halves, settings.adaptation, key, settings.handed, outcome, progress
+    )
     images, checkpoint = _denoise(item, frame, denoiser, settings, outcome, progress)
     if reference is not None:
         outcome.metrics = _measure(images, frame, reference)
@@ -145,7 +163,7 @@ def process(item: Item, settings: Settings, outcome: Outcome, progress: Progress
         picture,
         layers=layers,
         like=info,
-        spp=info.spp,
+        spp=outcome.spp,
         overwrite=settings.force,
         half=settings.half,
     )

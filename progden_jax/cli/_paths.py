@@ -15,6 +15,7 @@ class Item:
     input: Path
     output: Path
     variance_from: tuple[Path, ...] = ()
+    halves: tuple[Path, ...] = ()
     reference: Path | None = None
 
 
@@ -24,6 +25,7 @@ def plan(
     *,
     folder: bool = False,
     variance_from: Sequence[Path] = (),
+    halves: Sequence[Path] = (),
     reference: Path | None = None,
     force: bool = False,
     resume: bool = False,
@@ -35,7 +37,7 @@ def plan(
     inputs : files, and folders that stand for the .exr files in and below them.
     output : a file for one file, else a folder, whose files keep the names of the inputs.
     folder : whether `output` is to be a folder whatever it is called.
-    variance_from, reference : files, or folders that hold files named like the inputs.
+    variance_from, halves, reference : files, or folders that hold files named like the inputs.
     force : outputs may exist, and will be replaced.
     resume : inputs whose outputs exist are left out.
 
@@ -68,6 +70,7 @@ def plan(
             path,
             output / name if folder else output,
             tuple(_companion(other, name, "--variance-from", single) for other in variance_from),
+            tuple(_companion(other, name, "--halves", single) for other in halves),
             reference if reference is None else _companion(reference, name, "--reference", True),
         )
         for path, name in named
@@ -107,7 +110,9 @@ def _companion(path: Path, name: Path, flag: str, file_allowed: bool) -> Path:
 
 
 def _check(items: list[Item], force: bool) -> None:
-    read = {p.resolve() for i in items for p in (i.input, *i.variance_from, i.reference) if p}
+    read = {
+        p.resolve() for i in items for p in (i.input, *i.variance_from, *i.halves, i.reference) if p
+    }
     written: dict[Path, Path] = {}
     for item in items:
         target = item.output.resolve()

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Self
 
 from cyclopts import Parameter
 
+from progden_jax.cli._adaptation import AdaptOptions
 from progden_jax.cli._options import (
     SAVE,
     CostOptions,
@@ -45,6 +46,8 @@ progden denoise room.exr -o clean.exr
 progden denoise frames/ -o clean/ --quality high --save alpha,sure
 progden denoise frames/ -o clean/ --resume
 progden denoise room.exr -o clean.exr --variance-from roomA.exr roomB.exr
+progden denoise room.exr -o clean.exr --adapt
+progden denoise room.exr -o clean.exr --post-correct --halves roomA.exr roomB.exr
 progden denoise huge.exr -o clean.exr --max-memory 4GiB
 ```
 """
@@ -63,6 +66,7 @@ def denoise(
     ],
     read: ReadOptions | None = None,
     network: NetworkOptions | None = None,
+    adaptation: AdaptOptions | None = None,
     estimate: EstimateOptions | None = None,
     cost: CostOptions | None = None,
     save: Annotated[
@@ -86,9 +90,11 @@ def denoise(
 ) -> int:
     read, network = read or ReadOptions(), network or NetworkOptions()
     estimate, cost = estimate or EstimateOptions(), cost or CostOptions()
+    adaptation = adaptation or AdaptOptions()
     saved = parse_save(save)
     for options in (read, network, estimate, cost):
         options.check()
+    adaptation.check(read, network, cost)
     if network.no_aux and {"albedo", "normal"} & set(saved):
         raise UsageError("--no-aux leaves albedo and normal out, and --save asks for them.")
     if force and resume:
@@ -98,6 +104,7 @@ def denoise(
         Path(output),
         folder=output.endswith(("/", os.sep)),
         variance_from=read.variance_from or (),
+        halves=adaptation.halves or (),
         reference=reference,
         force=force,
         resume=resume,
@@ -111,14 +118,14 @@ def denoise(
 
     enable_compilation_cache()
     settings = Settings(
-        read, network, estimate, cost, saved, half, force, shapes=shared_shapes(items)
+        read, network, adaptation, estimate, cost, saved, half, force, shared_shapes(items)
     )
     return _run_all(
         items,
         lambda item, outcome, progress: process(item, settings, outcome, progress),
         json=json,
-        # An exact divergence reports its own progress, and takes all there is for as long as it takes.
-        at_once=1 if estimate.exact or cost.max_memory is not None else AT_ONCE,
+        # What reports progress of its own takes all there is for as long as it takes.
+        at_once=1 if estimate.exact or adaptation.fits or cost.max_memory is not None else AT_ONCE,
     )
 
 
@@ -200,7 +207,7 @@ class _Bars(Shown):
         self.many = total > 1
         self.files = self.bars.add_task("", total=total, name="", completed=-1, visible=self.many)
         self.part: TaskID | None = None
-        self.name = ""
+        self.name = self.label = ""
 
     def __enter__(self) -> Self:
         return super().__enter__() if self.many else self
@@ -211,12 +218,14 @@ class _Bars(Shown):
         self.name = name
         self.bars.update(self.files, advance=1, name=name)
 
-    def follow(self, done: int, total: int) -> None:
-        """Of the exact divergence of a file, in percent."""
+    def follow(self, done: int, total: int, of: str = "the exact divergence") -> None:
+        """Of what takes long with a file, in percent; one thing ends where the next begins."""
+        label = f"% of {of} of {self.name}"
+        if label != self.label:
+            self._end_part()
         if self.part is None:
             self.bars.start()
-            label = f"% of the exact divergence of {self.name}"
-            self.part = self.bars.add_task("", total=100, name=label)
+            self.part, self.label = self.bars.add_task("", total=100, name=label), label
         self.bars.update(self.part, completed=100 * done // total)
         if done == total:
             self._end_part()

@@ -30,6 +30,7 @@ list: [render, denoised, {mixer: runs/k4/weights.safetensors, label: trained wit
 ```
 
 Settings: image (mix, denoised, render, oracle), denoiser (a name, a file, FILE.py:FUNCTION), precision,
+adaptation (none, sure, post-correct) with adaptation.steps and the like and correction.window and the like,
 estimator, probes, epsilon, seed, mixer, mixer.window and mixer.confidence (of closed-form), bound, bound.a,
 bound.c, bound.window, bound.shift, bound.sigmoid, risk_probes (for SURE of the mix itself).
 

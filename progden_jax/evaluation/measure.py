@@ -90,11 +90,13 @@ class _Pair(NamedTuple):
 class _Estimate(NamedTuple):
     """The denoised image and what is known of it; only the image without an estimator.
 
+    `denoiser` is as it was before an adaptation, for its mixer is found by it; `fitted` is what came of that.
     `frame` has the buffers that the denoiser takes and no more, which would make other programs of the same.
     """
 
     frame: pd.Frame
     denoiser: Denoiser
+    fitted: Denoiser
     denoised: Image
     divergence: Image | None
     sure: Image | None
@@ -152,17 +154,21 @@ def _sound(frame: pd.Frame) -> pd.Frame:
 
 def _estimate(frame: pd.Frame, settings: Settings, max_memory: int | None) -> _Estimate:
     denoiser = parts.denoiser_for(frame, settings)
-    if isinstance(denoiser, Network):
+    if isinstance(denoiser, Network) and settings.adaptation != "post-correct":
         taken = {n: getattr(frame, n) for n in ("color", "variance", *denoiser.inputs)}
         frame = frame_of({name: buffer for name, buffer in taken.items() if buffer is not None})
+    fitted, fitting = denoiser, Cost(0.0)
+    if settings.fit() is not None:
+        fitted, fitting = metered(lambda: parts.adapted(frame, denoiser, settings))
+    made = functools.partial(_Estimate, frame, denoiser, fitted)
     method = settings.method()
     if method is None:
-        plain, cost = metered(lambda: pd.denoise(frame, denoiser, max_memory=max_memory))
-        return _Estimate(frame, denoiser, np.asarray(plain.image), None, None, cost)
+        plain, cost = metered(lambda: pd.denoise(frame, fitted, max_memory=max_memory))
+        return made(np.asarray(plain.image), None, None, fitting.then(cost))
     found, cost = metered(
         lambda: pd.progressive_denoise(
             frame,
-            denoiser,
+            fitted,
             mixer=_Nothing(),
             bound=False,
             method=method,
@@ -171,8 +177,8 @@ def _estimate(frame: pd.Frame, settings: Settings, max_memory: int | None) -> _E
             max_memory=max_memory,
         )
     )
-    denoised, divergence, risk = map(np.asarray, (found.denoised, found.divergence, found.sure))
-    return _Estimate(frame, denoiser, denoised, divergence, risk, cost)
+    images = map(np.asarray, (found.denoised, found.divergence, found.sure))
+    return made(*images, fitting.then(cost))
 
 
 @jax.tree_util.register_dataclass
@@ -221,7 +227,7 @@ def _show(settings: Settings, frame: pd.Frame, estimate: _Estimate | None) -> _S
     if settings.risk_probes:
         risk = risk_of_mix(
             estimate.frame,
-            estimate.denoiser,
+            estimate.fitted,
             mixer,
             settings.limits if settings.bound else None,
             method=cast(pd.Method, settings.method()),

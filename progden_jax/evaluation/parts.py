@@ -9,7 +9,7 @@ from typing import Any, cast
 import jax
 import jax.numpy as jnp
 
-from progden_jax import denoisers, mixers
+from progden_jax import adaptation, denoisers, mixers
 from progden_jax._fingerprint import fingerprint
 from progden_jax.denoisers import Denoiser, FunctionDenoiser
 from progden_jax.evaluation.settings import AUTO, DEFAULT, Settings
@@ -26,6 +26,20 @@ def denoiser_for(frame: Frame, settings: Settings) -> Denoiser:
     if name == AUTO:
         name = denoisers.for_frame(frame).name
     return load_denoiser(name, settings.precision)
+
+
+def adapted(frame: Frame, denoiser: Denoiser, settings: Settings) -> Denoiser:
+    """The denoiser adapted to the render as the settings say, or as it is."""
+    # Other numbers than the probes of the divergence.
+    key = jax.random.fold_in(jax.random.key(settings.seed), 1)
+    how = settings.fit()
+    if isinstance(how, adaptation.Adaptation):
+        return adaptation.adapt(frame, denoiser, adaptation=how, key=key).adapted
+    if isinstance(how, adaptation.PostCorrection):
+        halves_key, fit_key = jax.random.split(key)
+        halves = adaptation.split(frame, halves_key)
+        return adaptation.post_correct(halves, denoiser, correction=how, key=fit_key).denoiser
+    return denoiser
 
 
 def mixer_for(denoiser: Denoiser, settings: Settings) -> Mixer:

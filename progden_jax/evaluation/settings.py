@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping
 from typing import Any, Literal
 
 from progden_jax import _checks
+from progden_jax.adaptation import Adaptation, PostCorrection
 from progden_jax.denoisers import PRECISIONS
 from progden_jax.divergence import FiniteDifference, Method
 from progden_jax.mixers import CLOSED_FORM
@@ -21,7 +22,7 @@ DEFAULT = "default"
 """The mixer that `mixers.default_for` chooses."""
 
 NONE = "none"
-"""No estimate of the divergence, so no SURE."""
+"""No estimate of the divergence, so no SURE; or no adaptation."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,10 +34,13 @@ class Settings:
         AUTO  # a name, a file of weights, FILE.py:FUNCTION, or auto: OIDN's by the buffers
     )
     precision: str = "highest"  # of the denoiser's products
+    adaptation: Literal["none", "sure", "post-correct"] = "none"  # of the denoiser to the render
+    fitting: Adaptation = dataclasses.field(default_factory=Adaptation)
+    correction: PostCorrection = dataclasses.field(default_factory=PostCorrection)
     estimator: str = "monte-carlo"  # of the divergence, as `progden denoise --method`; or none
     probes: int = 1  # of that estimator
     epsilon: float = 1e-4  # of finite differences
-    seed: int = 0  # of the probes
+    seed: int = 0  # of the probes, and of all that an adaptation draws
     mixer: str = DEFAULT  # a name, a file of weights, closed-form, or default: the denoiser's
     closed_form: ClosedForm = dataclasses.field(default_factory=ClosedForm)
     bound: bool = True  # whether α is bounded
@@ -71,31 +75,44 @@ class Settings:
 
     def estimate(self) -> tuple[Any, ...]:
         """What determines the denoised image and the divergence; methods with equal ones share them."""
-        return (*self.program(), self.seed if self.method() is not None else 0)
+        drawn = self.method() is not None or self.adaptation != NONE
+        return (*self.program(), self.seed if drawn else 0)
 
     def program(self) -> tuple[Any, ...]:
         """What determines the compiled program that makes these."""
-        return (self.denoiser, self.precision, self.method())
+        return (self.denoiser, self.precision, self.method(), self.fit())
+
+    def fit(self) -> Adaptation | PostCorrection | None:
+        """How the denoiser is adapted, if it is."""
+        return {"sure": self.fitting, "post-correct": self.correction}.get(self.adaptation)
 
     def flat(self) -> dict[str, Any]:
         """The settings that matter to this method, by name, the defaults too."""
         used = ["image"]
         if self.image != "render":
             used += ["denoiser", "precision", "estimator"]
-            if self.estimator not in (NONE, "exact"):
-                used += ["probes", "seed"]
+            # Runs from before there was any stay as they are.
+            used += ["adaptation"] if self.adaptation != NONE else []
+            probed = self.estimator not in (NONE, "exact")
+            used += ["probes"] if probed else []
+            used += ["seed"] if probed or self.adaptation != NONE else []
             if self.estimator == "finite-difference":
                 used.append("epsilon")
         if self.image == "mix":
             used += ["mixer", "bound"]
         values: dict[str, Any] = {name: getattr(self, name) for name in used}
-        if self.image == "mix":
-            for prefix, relevant in (("mixer", self.mixer == CLOSED_FORM), ("bound", self.bound)):
-                part = getattr(self, _GROUPS[prefix][0])
-                if relevant:
-                    values |= {f"{prefix}.{k}": v for k, v in dataclasses.asdict(part).items()}
-            if self.risk_probes:
-                values["risk_probes"] = self.risk_probes
+        mixed, shown = self.image == "mix", self.image != "render"
+        relevant = {
+            "adaptation": shown and self.adaptation == "sure",
+            "correction": shown and self.adaptation == "post-correct",
+            "mixer": mixed and self.mixer == CLOSED_FORM,
+            "bound": mixed and self.bound,
+        }
+        for prefix in relevant:
+            if relevant[prefix]:
+                values |= _inner(prefix, self)
+        if mixed and self.risk_probes:
+            values["risk_probes"] = self.risk_probes
         return values
 
     def label(self, without: Collection[str] = ()) -> str:
@@ -120,10 +137,21 @@ class Settings:
 
 
 _GROUPS: dict[str, tuple[str, type]] = {
+    "adaptation": ("fitting", Adaptation),
+    "correction": ("correction", PostCorrection),
     "mixer": ("closed_form", ClosedForm),
     "bound": ("limits", Bound),
 }
 """Prefixes of dotted names -> the field that has them, and its type."""
+
+
+def _inner(prefix: str, settings: Settings) -> dict[str, Any]:
+    """The settings below that prefix, by full name, as JSON has them."""
+    values = dataclasses.asdict(getattr(settings, _GROUPS[prefix][0]))
+    return {
+        f"{prefix}.{name}": list(value) if isinstance(value, tuple) else value
+        for name, value in values.items()
+    }
 
 
 def names() -> dict[str, Any]:
@@ -133,9 +161,8 @@ def names() -> dict[str, Any]:
     found = {
         f.name: getattr(usual, f.name) for f in dataclasses.fields(Settings) if f.name not in inner
     }
-    for prefix, (field, _) in _GROUPS.items():
-        part = dataclasses.asdict(getattr(usual, field))
-        found |= {f"{prefix}.{name}": value for name, value in part.items()}
+    for prefix in _GROUPS:
+        found |= _inner(prefix, usual)
     return found
 
 

@@ -243,6 +243,9 @@ def _typed(name: str, value: Any, hint: Any) -> Any:
     if typing.get_origin(hint) is Literal:
         _checks.choice(name, value, typing.get_args(hint))
         return value
+    if typing.get_origin(hint) is types.UnionType:
+        (inner,) = (each for each in typing.get_args(hint) if each is not types.NoneType)
+        return None if value is None else _typed(name, value, inner)
     if typing.get_origin(hint) is tuple:
         (element, *_) = typing.get_args(hint)
         if not isinstance(value, list | tuple):

@@ -1,0 +1,49 @@
+"""The renders that the sweeps of this folder take: middles of the validation scenes, as they are or normal.
+
+    python -m experiments.adaptation.renders FOLDER [--crop 64] [--normal]
+
+With --normal each is the reference plus normal noise, whose variance is that of the render averaged over 5×5
+pixels: then all that Stein's estimate assumes holds, and the reference is the truth.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+import progden_jax as pd
+from experiments import _common
+from progden_jax.adaptation import pooled
+
+SPP = (32, 128, 512)
+POOL = 5
+
+
+def main() -> None:
+    parser = _common.parser(__doc__)
+    parser.add_argument("output", type=Path, help="a folder, made if missing")
+    parser.add_argument("--spp", type=int, nargs="+", default=SPP)
+    parser.add_argument("--crop", type=int, default=64, help="edge in pixels")
+    parser.add_argument("--normal", action="store_true", help="normal noise of known variance")
+    arguments = parser.parse_args()
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    names = _common.scenes(arguments.data, arguments.scenes)
+    for name, spp, frame, reference in _common.series(arguments.data, names, arguments.spp):
+        frame, reference = (_common.centre(f, arguments.crop) for f in (frame, reference))
+        if arguments.normal:
+            frame, reference = as_normal(frame, reference, seed=spp)
+        for count, image in ((spp, frame), (_common.REFERENCE_SPP, reference)):
+            path = arguments.output / f"{name}_{count:06}spp.exr"
+            pd.write_exr(path, image, overwrite=True)
+
+
+def as_normal(frame: pd.Frame, reference: pd.Frame, *, seed: int) -> tuple[pd.Frame, pd.Frame]:
+    """The reference with noise of the frame's variance, pooled, and the reference as the truth."""
+    made = pooled(frame, POOL)
+    variance = np.asarray(made.variance)
+    noise = np.random.default_rng(seed).normal(size=variance.shape) * np.sqrt(variance)
+    color = (np.asarray(reference.color) + noise).astype(np.float32)
+    return made.replace(color=color), reference.replace(variance=np.zeros_like(variance))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,154 @@
+"""`progden denoise --adapt`, `--post-correct` and `--halves`, through real files."""
+
+import importlib
+import json
+
+import jax
+import numpy as np
+import pytest
+
+import progden_jax as pd
+from progden_jax import adaptation
+from progden_jax.cli import main
+from progden_jax.exr import read_exr, write_exr
+
+SIZE = (20, 24)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def own_cache(tmp_path_factory):
+    """Compiled programs go to a folder of this module."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PROGDEN_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="module")
+def network(tmp_path_factory):
+    """A file of weights that compile at once."""
+    path = tmp_path_factory.mktemp("weights") / "net.safetensors"
+    pd.denoisers.save(path, pd.denoisers.KPCN.init(jax.random.key(0), layers=2, width=8))
+    return path
+
+
+@pytest.fixture
+def halves(tmp_path):
+    """Files of two renders with variances, a.exr and b.exr, and of their mean, whole.exr."""
+    rng = np.random.default_rng(0)
+    truth = 1 + np.linspace(0, 1, SIZE[0] * SIZE[1] * 3).reshape(*SIZE, 3)
+    a, b = (truth + 0.2 * rng.normal(size=truth.shape) for _ in range(2))
+    for name, color, variance in (("a", a, 0.04), ("b", b, 0.04), ("whole", (a + b) / 2, 0.02)):
+        frame = pd.Frame(color.astype("f4"), np.full(truth.shape, variance, "f4"))
+        write_exr(tmp_path / f"{name}.exr", frame)
+    return tmp_path
+
+
+@pytest.fixture
+def denoise(network, capsys):
+    """Run the command with that network; gives the status, what --json told, and stderr."""
+
+    def call(*words):
+        words = ["denoise", *words, "--denoiser", network, "--mixer", "closed-form", "--json"]
+        status = main([str(word) for word in words])
+        out, err = capsys.readouterr()
+        assert "Traceback" not in err
+        return status, json.loads(out) if out else None, err
+
+    return call
+
+
+def test_adapted_by_sure(halves, network, denoise):
+    """As by the library with the key of the command's seed, and told of."""
+    out = halves / "out.exr"
+    status, (told,), err = denoise(
+        halves / "whole.exr", "-o", out, "--adapt", "--adapt-steps", 3, "--save", "denoised"
+    )
+    assert (status, err) == (0, "")
+    frame = read_exr(halves / "whole.exr")
+    found = adaptation.adapt(
+        frame,
+        pd.denoisers.load(network),
+        adaptation=adaptation.Adaptation(steps=3),
+        key=jax.random.fold_in(jax.random.key(0), 1),
+    )
+    expected = jax.jit(lambda d, f: d(f))(found.adapted, frame)
+    written = pd.exr.read_layers(out)
+    np.testing.assert_allclose(written["denoised"], expected, rtol=1e-5, atol=1e-6)
+    assert told["denoiser"] == "net"
+    assert told["adaptation"]["kind"] == "sure"
+    assert told["adaptation"]["steps"] == found.step
+    assert told["adaptation"]["risk_after"] == pytest.approx(found.after)
+
+
+def test_a_sequence_is_corrected_by_its_halves(halves, denoise, monkeypatch):
+    """In order, each frame from the weights of the one before, its halves from folders of the same names."""
+    names = ("one.exr", "two.exr")
+    for folder, file in (("in", "whole"), ("a", "a"), ("b", "b")):
+        (halves / folder).mkdir()
+        for name in names:
+            (halves / folder / name).write_bytes((halves / f"{file}.exr").read_bytes())
+    starts = []
+    genuine = adaptation.post_correct
+
+    def correct(given, *others, start, **settings):
+        starts.append(start)
+        np.testing.assert_allclose(
+            given.both()[0].color, read_exr(halves / "a.exr").color, atol=1e-6
+        )
+        np.testing.assert_array_equal(given.frame.variance, np.float32(0.02))
+        return genuine(given, *others, start=start, **settings)
+
+    monkeypatch.setattr(adaptation, "post_correct", correct)
+    flags = ["--post-correct", "--sequence", "--adapt-steps", 1]
+    flags += ["--halves", halves / "a", halves / "b"]
+    status, told, err = denoise(halves / "in", "-o", halves / "out", *flags)
+    assert (status, err) == (0, "")
+    assert [t["adaptation"]["reused"] for t in told] == [False, True]
+    assert {t["adaptation"]["halves"] for t in told} == {"given"}
+    assert [t["adaptation"]["steps"] for t in told] == [1, 1]
+    assert starts[0] is None
+    assert starts[1] is not None
+    assert sorted(p.name for p in (halves / "out").iterdir()) == sorted(names)
+
+
+def test_the_input_may_be_one_of_the_halves(halves, denoise):
+    out = halves / "out.exr"
+    words = ["--post-correct", "--adapt-steps", 1, "--save", "noisy,variance"]
+    pair = ["--halves", halves / "a.exr", halves / "b.exr"]
+    status, _, _ = denoise(halves / "a.exr", "-o", out, *words, *pair)
+    assert status == 0
+    written = pd.exr.read_layers(out)
+    whole = read_exr(halves / "whole.exr")
+    np.testing.assert_allclose(written["noisy"], whole.color, atol=1e-6)
+    np.testing.assert_allclose(written["noisy_variance"], whole.variance, rtol=1e-6)
+    bright = read_exr(halves / "whole.exr")
+    write_exr(halves / "other.exr", bright.replace(color=2 * bright.color))
+    status, (told,), _ = denoise(halves / "other.exr", "-o", halves / "no.exr", *words, *pair)
+    assert (status, "neither their mean nor one of them" in told["error"]) == (1, True)
+    assert not (halves / "no.exr").exists()
+
+
+def test_an_interrupt_leaves_nothing(halves, denoise, monkeypatch):
+    seen = []
+
+    def follow(bars, done, total, of="the exact divergence"):
+        seen.append((done, total, of))
+        if done == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(importlib.import_module("progden_jax.cli.denoise")._Bars, "follow", follow)
+    status, _, err = denoise(
+        halves / "whole.exr", "-o", halves / "out.exr", "--adapt", "--adapt-steps", 3
+    )
+    assert (status, "interrupted" in err) == (130, True)
+    assert seen == [(1, 3, "the adaptation"), (2, 3, "the adaptation")]
+    assert not (halves / "out.exr").exists()
+
+
+def test_without_a_variance_there_is_nothing_to_fit_by(halves, denoise):
+    plain = halves / "plain.exr"
+    write_exr(plain, read_exr(halves / "whole.exr").replace(variance=None))
+    for flag in ("--adapt", "--post-correct"):
+        status, (told,), _ = denoise(plain, "-o", halves / "out.exr", flag)
+        assert status == 1
+        assert "has no variance" in told["error"]
