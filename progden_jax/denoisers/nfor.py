@@ -165,12 +165,12 @@ class NFOR:
         return self.windows.reach + chosen
 
 
-_FEATURE = {
-    "albedo": lambda albedo: albedo,
-    "normal": lambda normal: normal,
-    # Ratios of distances matter, whatever the scene's unit; 0 is a ray that hits nothing.
-    "depth": lambda depth: jnp.where(depth > 0, jnp.log(jnp.where(depth > 0, depth, 1)), 0),
-}
+def log_depth(depth: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Ratios of distances matter, whatever the scene's unit; 0 is a ray that hits nothing, and stays 0."""
+    return jnp.where(depth > 0, jnp.log(jnp.where(depth > 0, depth, 1)), 0)
+
+
+_FEATURE = {"albedo": lambda albedo: albedo, "normal": lambda normal: normal, "depth": log_depth}
 
 
 @jax.jit
