@@ -46,11 +46,16 @@ def weighted_sums(
         start = (*[0] * (planes.ndim - 2), first // window, first % window)
         return jax.lax.dynamic_slice(padded, start, (*planes.shape[:-1], width + count - 1))
 
-    def add_row(total: Array, given: tuple[Array, Array]) -> tuple[Array, None]:
-        first, weights = given
+    @jax.checkpoint  # else shifted planes are kept beside their weights
+    def row_sums(first: Array, weights: Array) -> Array:
         there = row(first, columns)[:summed]
-        parts = [w * there[..., k : k + width] for k, w in enumerate(weights)]
-        return sum(parts, start=total), None
+        # By split, for its transpose joins the slopes: indexing would add them, padded, one by one.
+        apart = jax.lax.split(weights, [1] * columns)
+        parts = [w * there[..., k : k + width] for k, w in enumerate(apart)]
+        return sum(parts[1:], start=parts[0])
+
+    def add_row(total: Array, given: tuple[Array, Array]) -> tuple[Array, None]:
+        return total + row_sums(*given), None
 
     @jax.checkpoint
     def part(first: Array) -> Array:

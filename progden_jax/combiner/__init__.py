@@ -5,7 +5,7 @@ Back et al. 2020. `load` puts trained weights behind a denoiser, and what it giv
 """
 
 from progden_jax.combiner.denoiser import BufferedCombiner, DeepCombiner, of_buffers
-from progden_jax.combiner.files import load, names, save
+from progden_jax.combiner.files import Weights, load, names, read, save
 from progden_jax.combiner.kernels import combine
 from progden_jax.combiner.network import KernelNetwork
 
@@ -13,9 +13,11 @@ __all__ = [
     "BufferedCombiner",
     "DeepCombiner",
     "KernelNetwork",
+    "Weights",
     "combine",
     "load",
     "names",
     "of_buffers",
+    "read",
     "save",
 ]

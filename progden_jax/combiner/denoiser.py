@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from progden_jax import _checks
 from progden_jax.combiner.network import KernelNetwork, Params
 from progden_jax.denoisers import Denoiser
-from progden_jax.denoisers._base import Bound, passable
+from progden_jax.denoisers._base import Bound
 from progden_jax.denoisers._network import Valid, inside_of
 from progden_jax.frame import Frame, repair
 
@@ -32,7 +32,8 @@ class DeepCombiner:
     Parameters
     ----------
     params : the network's weights, see `KernelNetwork.init`.
-    denoiser : what gives the correlated pixels; the weights may have been trained for another.
+    denoiser : what gives the correlated pixels, a pytree (`load` sees to that); the weights may have been
+        trained for another.
     network : the settings that the weights belong to; of several buffers, see `of_buffers`.
 
     References
@@ -259,7 +260,7 @@ def _bound(denoiser: Denoiser, frame: Frame, valid: Valid, exposure: Any) -> Bou
     """The denoiser's function, told only what it takes."""
     told = {"valid": valid, "exposure": exposure}
     given = {name: value for name, value in told.items() if value is not None}
-    return passable(denoiser).bind(frame, **given)
+    return cast(Any, denoiser).bind(frame, **given)
 
 
 def _taken(combiner: DeepCombiner, frame: Frame) -> dict[str, Array]:

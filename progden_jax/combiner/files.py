@@ -5,11 +5,13 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 from progden_jax import _safetensors, denoisers
 from progden_jax.combiner.denoiser import DeepCombiner
-from progden_jax.combiner.network import KernelNetwork
+from progden_jax.combiner.network import KernelNetwork, Params
 from progden_jax.denoisers import Denoiser, files
+from progden_jax.denoisers._base import passable
 
 KIND = "combiner"
 
@@ -49,6 +51,14 @@ def save(
     _safetensors.write(path, combiner.params, {**said, **own}, dtype=dtype)
 
 
+class Weights(NamedTuple):
+    """What a file holds: the weights, the network that they are of, and where they come from."""
+
+    params: Params
+    network: KernelNetwork
+    metadata: dict[str, str]
+
+
 def load(name: str | os.PathLike[str], denoiser: Denoiser | None = None) -> DeepCombiner:
     """The combiner of those weights behind a denoiser.
 
@@ -62,27 +72,33 @@ def load(name: str | os.PathLike[str], denoiser: Denoiser | None = None) -> Deep
     ValueError
         If there is no such name or file, or the file holds no combiner.
     """
+    params, network, metadata = read(name)
+    if denoiser is None:
+        denoiser = denoisers.load(metadata.get("denoiser", ""))
+    return DeepCombiner(params, passable(denoiser), network)
+
+
+def read(name: str | os.PathLike[str]) -> Weights:
+    """The weights alone; arguments and errors are `load`'s."""
     text = os.fspath(name)
     path = Path(text)
     if not text.endswith(_safetensors.ENDING):
         if text not in names():
             raise ValueError(
-                f"combiner is {text!r}, expected one of {', '.join(names()) or 'none yet'}, or a path that "
-                f"ends in {_safetensors.ENDING}."
+                f"combiner is {text!r}, expected one of {', '.join(names())}, or a path that ends in "
+                f"{_safetensors.ENDING}."
             )
         path = _shipped()[text]
     params, metadata = _safetensors.read(path)
     if metadata.get("kind") != KIND:
+        found = metadata.get("kind") or metadata.get("architecture", "nothing")
         raise ValueError(
-            f"{path} holds no combiner (its metadata says "
-            f"{metadata.get('kind') or metadata.get('architecture', 'nothing')!r}): give a file from "
-            "`progden train combiner` or progden_jax.combiner.save."
+            f"{path} holds no combiner (its metadata says {found!r}): give a file from `progden train "
+            "combiner` or progden_jax.combiner.save."
         )
     try:
         network = KernelNetwork(**json.loads(metadata["options"]))
         network.check(params)
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: {error}") from None
-    if denoiser is None:
-        denoiser = denoisers.load(metadata.get("denoiser", ""))
-    return DeepCombiner(params, denoiser, network)
+    return Weights(params, network, metadata)

@@ -21,7 +21,7 @@ DEFAULT = "default"
 """The mixer that `mixers.default_for` chooses."""
 
 NONE = "none"
-"""No estimate of the divergence, so no SURE."""
+"""No estimate of the divergence, so no SURE; no combiner."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,6 +32,7 @@ class Settings:
     denoiser: str = (
         AUTO  # a name, a file of weights, FILE.py:FUNCTION, or auto: OIDN's by the buffers
     )
+    combiner: str = NONE  # a name or a file of weights of a deep combiner behind it; or none
     precision: str = "highest"  # of the denoiser's products
     estimator: str = "monte-carlo"  # of the divergence, as `progden denoise --method`; or none
     probes: int = 1  # of that estimator
@@ -70,13 +71,15 @@ class Settings:
 
     def program(self) -> tuple[Any, ...]:
         """What determines the compiled program that makes these."""
-        return (self.denoiser, self.precision, self.method())
+        return (self.denoiser, self.combiner, self.precision, self.method())
 
     def flat(self) -> dict[str, Any]:
         """The settings that matter to this method, by name, the defaults too."""
         used = ["image"]
         if self.image != "render":
             used += ["denoiser", "precision", "estimator"]
+            if self.combiner != NONE:
+                used.append("combiner")
             if self.estimator not in (NONE, "exact"):
                 used += ["probes", "seed"]
             if self.estimator == "finite-difference":
@@ -175,4 +178,4 @@ def _short(value: str) -> str:
 def _word(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    return f"{value:g}" if isinstance(value, float) else _short(str(value))
