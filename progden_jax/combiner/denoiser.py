@@ -14,7 +14,7 @@ from progden_jax.combiner.network import KernelNetwork, Params
 from progden_jax.denoisers import Denoiser
 from progden_jax.denoisers._base import Bound
 from progden_jax.denoisers._network import Valid, inside_of
-from progden_jax.frame import Frame, repair
+from progden_jax.frame import Frame, repaired
 
 
 @functools.partial(
@@ -239,7 +239,7 @@ def of_buffers(combiner: DeepCombiner, frames: Sequence[Frame]) -> tuple[Frame, 
         _checks.same_shape(
             f"frames[{number}].color", frame.color, "frames[0].color", frames[0].color
         )
-    sound = [_repaired(frame) for frame in frames]
+    sound = [repaired(frame) for frame in frames]
     means: dict[str, Any] = {}
     for name in ("color", "albedo", "normal", "depth", "variance", "spp"):
         found = [getattr(frame, name) for frame in sound]
@@ -273,8 +273,3 @@ def _taken(combiner: DeepCombiner, frame: Frame) -> dict[str, Array]:
             f"{' and no '.join(missing)}: give the buffer, or weights that were trained without it."
         )
     return buffers
-
-
-@jax.jit
-def _repaired(frame: Frame) -> Frame:
-    return repair(frame)[0]
