@@ -3,8 +3,11 @@
 import numpy as np
 
 
-def combine(noisy, denoised, weights, window):
-    """Eq. 14 of (B, H, W, 3) sub-averages; weights (B, window², H, W), offsets in raster order."""
+def combine(noisy, denoised, weights, window, reliability=None, trust=None):
+    """Eq. 14 of (B, H, W, 3) sub-averages; weights (B, window², H, W), offsets in raster order.
+
+    With them, the reliability (B, H, W) of each value and the weight (H, W) of the mean denoised one.
+    """
     buffers, height, width, _ = noisy.shape
     radius = window // 2
     result = np.zeros(noisy.shape[1:])
@@ -16,11 +19,16 @@ def combine(noisy, denoised, weights, window):
                 if not (0 <= there[0] < height and 0 <= there[1] < width):
                     continue
                 weight = weights[b, offset, *c]
+                if reliability is not None:
+                    weight *= reliability[b, *there]
                 norm += weight
                 if there == c:
                     total += weight * noisy[b, *c]
                 else:
                     total += weight * (noisy[b, *there] + denoised[b, *c] - denoised[b, *there])
+        if trust is not None:
+            total += trust[c] * denoised[:, *c].mean(0)
+            norm += trust[c]
         result[c] = total / norm
     return result
 
@@ -66,5 +74,8 @@ def network(settings, params, noisy, denoised, frame):
     for n in range(1, settings.layers):
         h = np.maximum(convolution(h, params[f"conv{n}"]), 0)
     logits = convolution(h, params["kernel"]).transpose(2, 0, 1)
+    count = settings.buffers * settings.window**2
     shape = (settings.buffers, settings.window**2, *logits.shape[1:])
-    return combine(noisy, denoised, np.exp(logits).reshape(shape), settings.window)
+    further = (np.exp(logits[count:-1]), np.exp(logits[-1])) if settings.robust else ()
+    weights = np.exp(logits[:count]).reshape(shape)
+    return combine(noisy, denoised, weights, settings.window, *further)

@@ -139,9 +139,9 @@ def test_weights_do_not_all_exist_at_once(monkeypatch):
     assert program.memory_analysis().temp_size_in_bytes < 0.7 * 225 * 64 * 64 * 4
 
 
-@pytest.mark.parametrize("buffers", [1, 2])
-def test_network_is_the_dense_one(buffers):
-    network = dataclasses.replace(SMALL, buffers=buffers)
+@pytest.mark.parametrize(("buffers", "robust"), [(1, False), (2, True)])
+def test_network_is_the_dense_one(buffers, robust):
+    network = dataclasses.replace(SMALL, buffers=buffers, robust=robust)
     params = weights_of(network)
     noisy = np.stack([frame_of(seed=n).color for n in range(buffers)])
     denoised = np.stack([np.asarray(COLUMN(FRAME.replace(color=x))) for x in noisy])

@@ -9,7 +9,7 @@ import pytest
 from code_generation import as_for_users
 
 import progden_jax as pd
-from progden_jax import _safetensors, mixers
+from progden_jax import _safetensors, combiner, mixers
 from progden_jax.denoisers import files
 
 FILES = {path.stem: path for path in files.FOLDER.glob("*.safetensors")}
@@ -21,7 +21,8 @@ RECORDED: dict[str, list[float]] = {
     "mixer-unet-hdr": [0.739653, 0.603126, 0.712924, 0.731417, 0.222536, 0.483584],
     "unet-hdr": [0.0606872, 0.0305358, 0.0520162, 0.10864, 0.0451267, 0.0947322],
 }
-"""Means of red, green and blue, then one pixel: of a denoised crop, or of a mixer's α on it."""
+"""Means of red, green and blue, then one pixel: of a denoised crop, also a blurred one with a combiner behind
+it, or of a mixer's α on that."""
 
 
 @pytest.fixture(scope="module")

@@ -28,6 +28,8 @@ def combine(
     weigh: Weigh,
     *,
     window: int,
+    reliability: Float[Array, "b n h w 1"] | None = None,
+    trust: Float[Array, "n h w 1"] | None = None,
     inside: Bool[Array, "h w 1"] | None = None,
 ) -> Float[Array, "n h w 3"]:
     """β = Σ_b Σ_i w_ib (y_ib + z_cb − z_ib) / Σ_b Σ_i w_ib over the window inside the image.
@@ -40,6 +42,8 @@ def combine(
         correlated versions z_b, of n images; B = 1 is the kernel of one buffer.
     weigh : gives the weights of some rows of one buffer's window; the centre's is among them.
     window : odd width in pixels.
+    reliability : of every y_ib, > 0, by which its weight is multiplied in all windows; None: 1.
+    trust : weight ≥ 0 of the mean of z_c itself, as one more estimate of its pixel; None: 0.
     inside : False where the images are padding.
 
     Raises
@@ -50,7 +54,8 @@ def combine(
     Notes
     -----
     Back et al. 2020, "Deep Combiner for Independent and Correlated Pixel Estimates", Eq. 14, and Eqs. 4 and
-    8 with one buffer. Of B·window² weights per pixel `window` exist at a time where images are large.
+    8 with one buffer; reliability and trust are not in it. Of B·window² weights per pixel `window` exist at a
+    time where images are large.
     """
     _checks.images("noisy", noisy)
     _checks.same_shape("denoised", denoised, "noisy", noisy)
@@ -58,6 +63,8 @@ def combine(
     residual = noisy - denoised
     counted = jnp.ones_like(residual[..., :1])
     both = jnp.concatenate([residual, counted], axis=-1)
+    if reliability is not None:
+        both = both * reliability
     if inside is not None:
         both = jnp.where(inside, both, 0)
 
@@ -77,5 +84,6 @@ def combine(
     # Around the mean, for buffers that are equal must come out exactly as they are.
     middle = denoised.mean(0)
     shifted = weights * (denoised - middle) + filtered
-    total = jnp.maximum(weights.sum(0), jnp.finfo(weights.dtype).tiny)
+    total = weights.sum(0) if trust is None else weights.sum(0) + trust
+    total = jnp.maximum(total, jnp.finfo(weights.dtype).tiny)
     return middle + shifted.sum(0) / total

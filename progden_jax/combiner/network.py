@@ -1,6 +1,7 @@
 """The network that predicts the weights of the combination kernel."""
 
 import dataclasses
+import math
 from collections.abc import Mapping
 
 import jax
@@ -25,8 +26,8 @@ BUFFERS = {"albedo": 3, "normal": 3, "depth": 1, "variance": 3}
 
 _LAST = "kernel"
 _EPSILON = 0.01
-_MOST = 30.0
-"""Bound on logits: e^±30, summed, squared and divided, is well within float32."""
+_MOST = 15.0
+"""Bound on logits: products of two e^±15, summed, squared and divided, are well within float32."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,6 +40,9 @@ class KernelNetwork:
         them and the edge of their kernels in pixels, odd.
     window : odd width in pixels of the combination kernel.
     buffers : sub-averages of the samples that are combined; the paper's extension has 4.
+    robust : what the paper has not: every pixel has a reliability too, and the denoised pixel a weight as an
+        estimate of itself, see `combine`. Else a firefly has to be known by its place in the window of each
+        pixel around, and noise is added where the denoised image was right.
     inputs : buffers that the network sees besides the images, some of `BUFFERS` in this order.
 
     Raises
@@ -57,6 +61,7 @@ class KernelNetwork:
     layer_size: int = 5
     window: int = 15
     buffers: int = 1
+    robust: bool = False
     inputs: tuple[str, ...] = tuple(BUFFERS)
 
     def __post_init__(self) -> None:
@@ -75,8 +80,8 @@ class KernelNetwork:
 
     @property
     def outputs(self) -> int:
-        """Weights per pixel: the window's of every buffer."""
-        return self.buffers * self.window**2
+        """Per pixel: weights of the window of every buffer, then reliabilities and the denoised pixel's."""
+        return self.buffers * self.window**2 + (self.buffers + 1 if self.robust else 0)
 
     @property
     def receptive_radius(self) -> int:
@@ -107,9 +112,15 @@ class KernelNetwork:
             )
 
     def init(self, key: jax.Array) -> dict[str, dict[str, Array]]:
-        """Weights to start from: He's, with which the kernel is nearly uniform."""
+        """Weights to start from: He's, with which the kernel is nearly uniform.
+
+        Where it may trust the denoised pixel, that has the other half of the weight.
+        """
         params = he_normal(key, self.form)
         params[_LAST]["kernel"] = 0.1 * params[_LAST]["kernel"]
+        if self.robust:
+            half = math.log(self.buffers * self.window**2)
+            params[_LAST]["bias"] = params[_LAST]["bias"].at[-1].set(half)
         return params
 
     def apply(
@@ -137,11 +148,18 @@ class KernelNetwork:
         kernel, bias = params[_LAST]["kernel"], params[_LAST]["bias"]
 
         def weigh(buffer: Array, first: Array, count: int) -> Array:
-            logits = some_outputs(h, kernel, bias, buffer * self.window**2 + first, count)
+            return positive(buffer * self.window**2 + first, count)
+
+        def positive(first: Array | int, count: int) -> Array:
+            logits = some_outputs(h, kernel, bias, first, count)
             # A softmax over the window, in one pass: bounded, its largest logit need not be known.
             return jnp.exp(jnp.clip(logits, -_MOST, _MOST))
 
-        return combine(noisy, denoised, weigh, window=self.window, inside=inside)
+        further = {}
+        if self.robust:
+            *reliability, trust = positive(self.buffers * self.window**2, self.buffers + 1)
+            further = {"reliability": jnp.stack(reliability)[..., None], "trust": trust[..., None]}
+        return combine(noisy, denoised, weigh, window=self.window, inside=inside, **further)
 
     def _seen(
         self,
