@@ -275,6 +275,39 @@ def test_behind_a_function_it_neither_tiles_nor_pads():
     np.testing.assert_allclose(behind(FRAME), expected, rtol=1e-5, atol=1e-6)
 
 
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Gained:
+    """A filter whose gain depends on the image that it is found for; `filtered` shares it."""
+
+    def __call__(self, frame):
+        return self.bind(frame)(frame.color)
+
+    def bind(self, frame):
+        del frame
+        return BoundGained()
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class BoundGained:
+    def __call__(self, x):
+        return self.filtered(x, x[None])[0]
+
+    def filtered(self, x, images):
+        return images / (1 + x.mean())
+
+
+def test_buffers_share_their_means_kernels():
+    network = dataclasses.replace(SMALL, buffers=2)
+    two = combiner.DeepCombiner(weights_of(network), Gained(), network)
+    frame, buffered = combiner.of_buffers(two, [FRAME.replace(color=2 * FRAME.color), FRAME])
+    colors = np.stack([2 * FRAME.color, FRAME.color])
+    denoised = colors / (1 + colors.mean())
+    expected = dense_combiner.network(network, two.params, colors, denoised, frame)
+    np.testing.assert_allclose(buffered(frame), expected, rtol=1e-4, atol=1e-5)
+
+
 def test_several_buffers():
     """Their mean is the frame; each is denoised by itself; the result is a denoiser for that frame."""
     network = dataclasses.replace(SMALL, buffers=2)

@@ -36,15 +36,28 @@ def mixed():
     return jax.jit(lambda mixer, *images: mixer(*images), compiler_options=as_for_users())
 
 
-def output(name: str, frame: pd.Frame, mixed) -> jax.Array:
+@pytest.fixture(scope="module")
+def denoised():
+    """The image of any denoiser, by one program for all of a kind."""
+    return jax.jit(
+        lambda denoiser, frame: denoiser.bind(frame)(frame.color), compiler_options=as_for_users()
+    )
+
+
+def blur(x):
+    return sum(jnp.roll(x, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)) / 9
+
+
+BLUR = pd.FunctionDenoiser(blur)
+
+
+def output(name: str, frame: pd.Frame, mixed, denoised) -> jax.Array:
+    if name.startswith("combiner-"):
+        return denoised(combiner.load(name.removeprefix("combiner-"), BLUR), frame)
     if not name.startswith("mixer-"):
-        run = jax.jit(
-            lambda denoiser, frame: denoiser.bind(frame)(frame.color),
-            compiler_options=as_for_users(),
-        )
-        return run(pd.denoisers.load(name), frame)
+        return denoised(pd.denoisers.load(name), frame)
     x, variance = frame.color, frame.variance
-    y = sum(jnp.roll(x, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)) / 9
+    y = blur(x)
     divergence = variance / 9
     risk = pd.sure(x, y, variance, divergence)
     mixer = pd.load_mixer(name.removeprefix("mixer-"))
@@ -54,6 +67,7 @@ def output(name: str, frame: pd.Frame, mixed) -> jax.Array:
 def test_every_file_is_recorded_and_found_by_name():
     assert set(FILES) == set(RECORDED)
     named = {*files.shipped(), *(f"mixer-{n}" for n in mixers.names() if n != mixers.CLOSED_FORM)}
+    named |= {f"combiner-{n}" for n in combiner.names()}
     assert named == set(FILES)
 
 
@@ -69,7 +83,7 @@ def test_small_and_with_its_origin(name):
 
 
 @pytest.mark.parametrize("name", sorted(FILES))
-def test_outputs_are_those_recorded(name, crop, mixed):
-    found = np.asarray(output(name, crop, mixed))
+def test_outputs_are_those_recorded(name, crop, mixed, denoised):
+    found = np.asarray(output(name, crop, mixed, denoised))
     summary = [*found.mean((0, 1)), *found[9, 21]]
     np.testing.assert_allclose(summary, RECORDED[name], rtol=1e-3, atol=1e-5)

@@ -182,17 +182,17 @@ class BufferedCombiner:
                 f"the sub-averages are of shape {tuple(shape)} and frame.color of {frame.color.shape}: they "
                 "belong to the frame that they make up."
             )
-        variance, spp = frame.variance, frame.spp
-        part = frame.replace(
-            variance=None if variance is None else count * variance,
-            spp=None if spp is None else spp / count,
-        )
-        inner = [
-            _bound(self.combiner.denoiser, part.replace(color=frame.color + d), None, None)
-            for d in self.differences
-        ]
+        denoiser = self.combiner.denoiser
+        whole = _bound(denoiser, frame, None, None)
+        if hasattr(whole, "filtered"):
+            inner = [whole]
+        else:
+            part = _share(frame, count)
+            inner = [
+                _bound(denoiser, part.replace(color=frame.color + d), None, None)
+                for d in self.differences
+            ]
         buffers = _taken(self.combiner, frame)
-        # As a partial of weights, for what is bound passes through jit.
         held = BoundCombiner(self.combiner.params, inner, buffers, None, self.combiner.network)
         return jax.tree_util.Partial(_run_buffers, held, self.differences)
 
@@ -200,14 +200,27 @@ class BufferedCombiner:
 @jax.jit
 def _run_buffers(f: BoundCombiner, differences: Array, x: Array) -> Array:
     noisy = x + differences
-    denoised = [inner(part) for inner, part in zip(f.inner, noisy, strict=True)]
-    return _applied(f, noisy, jnp.stack(denoised))
+    if len(f.inner) < len(differences):
+        denoised = f.inner[0].filtered(x, noisy)
+    else:
+        denoised = jnp.stack([g(part) for g, part in zip(f.inner, noisy, strict=True)])
+    return _applied(f, noisy, denoised)
+
+
+def _share(frame: Frame, count: int) -> Frame:
+    """The frame with the variance and the samples of one of so many equal parts of it."""
+    variance, spp = frame.variance, frame.spp
+    return frame.replace(
+        variance=None if variance is None else count * variance,
+        spp=None if spp is None else spp / count,
+    )
 
 
 def of_buffers(combiner: DeepCombiner, frames: Sequence[Frame]) -> tuple[Frame, BufferedCombiner]:
     """The render that sub-averages of its samples make up, and a denoiser for it that combines them.
 
-    Each sub-average is denoised by itself.
+    The sub-averages are filtered by the kernels that the denoiser finds for their mean, where what it binds
+    has ``filtered(x, images)``, as that of `NFOR` has; else each is denoised by itself.
 
     Parameters
     ----------
@@ -227,7 +240,7 @@ def of_buffers(combiner: DeepCombiner, frames: Sequence[Frame]) -> tuple[Frame, 
 
     Notes
     -----
-    Back et al. 2020, section 4.4; denoised one by one as in its section 5, where kernels are not shared.
+    Back et al. 2020, sections 4.4 and 5.
     """
     expected = combiner.network.buffers
     if len(frames) != expected:

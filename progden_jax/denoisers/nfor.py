@@ -198,6 +198,15 @@ class BoundNFOR:
         _checks.same_shape("x", x, "the frame's variance", self.variance)
         return _run(self, x)
 
+    def filtered(
+        self, x: Float[Array, "h w 3"], images: Float[Array, "b h w 3"]
+    ) -> Float[Array, "b h w 3"]:
+        """Other images, filtered as x is: by the same kernels and bandwidths; at least 0."""
+        _checks.image("x", x)
+        _checks.images("images", images)
+        _checks.same_shape("images[0]", images[0], "x", x)
+        return _run(self, x, images)
+
     @property
     def receptive_radius(self) -> int:
         """How many pixels away an output pixel can depend on the input."""
@@ -210,7 +219,7 @@ class BoundNFOR:
 
 
 @jax.jit
-def _run(f: BoundNFOR, x: Array) -> Array:
+def _run(f: BoundNFOR, x: Array, others: Array | None = None) -> Array:
     inside = inside_of(x.shape[:2], f.valid)
     if inside is None:
         inside = jnp.ones((*x.shape[:2], 1), bool)
@@ -224,6 +233,10 @@ def _run(f: BoundNFOR, x: Array) -> Array:
         half = shown(f.difference)
         images, guides = (jnp.stack((color + s * half, color - s * half)) for s in (1, -1))
         variance = 2 * variance
+    if others is not None:
+        beside = jnp.concatenate([shown(image) for image in others], -1)
+        beside = jnp.broadcast_to(beside, (len(images), *beside.shape))
+        images = jnp.concatenate([images, beside], -1)
     settings = f.denoiser
     found = lax.map(
         lambda pair: regress(
@@ -241,12 +254,15 @@ def _run(f: BoundNFOR, x: Array) -> Array:
     )
     candidates, leverage = (a.mean(0) for a in found)
     if len(settings.bandwidths) > 1:
-        risks = (candidates - x) ** 2 + 2 * f.variance * leverage[..., None]
+        risks = (candidates[..., :3] - x) ** 2 + 2 * f.variance * leverage[..., None]
         share = lax.stop_gradient(_least_risk(jnp.where(inside, risks, 0), inside))
         mixed = (share * candidates).sum(0)
     else:
         mixed = candidates[0]
-    return jnp.where(inside & (mixed > 0), mixed, 0)
+    result = jnp.where(inside & (mixed > 0), mixed, 0)
+    if others is None:
+        return result
+    return jnp.stack(jnp.split(result[..., 3:], len(others), -1))
 
 
 def _least_risk(risks: Float[Array, "k h w 3"], inside: Array) -> Float[Array, "k h w 1"]:
