@@ -73,7 +73,7 @@ def some_outputs(
     features: Float[Array, "n h w c"],
     kernel: Float[Array, "k k c o"],
     bias: Float[Array, " o"],
-    first: Array,
+    first: Array | int,
     count: int,
 ) -> Float[Array, "count n h w"]:
     """A convolution's outputs from `first` on, so many, as planes."""

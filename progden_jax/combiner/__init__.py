@@ -4,7 +4,8 @@ Back et al. 2020. `load` puts trained weights behind a denoiser, and what it giv
 `progden_jax.progressive_denoise` and all else; `progden train combiner` makes weights.
 """
 
-from progden_jax.combiner.denoiser import BufferedCombiner, DeepCombiner, of_buffers
+from progden_jax.combiner.buffers import BufferedCombiner, of_buffers
+from progden_jax.combiner.denoiser import DeepCombiner
 from progden_jax.combiner.files import Weights, load, names, read, save
 from progden_jax.combiner.kernels import combine
 from progden_jax.combiner.network import KernelNetwork

@@ -79,8 +79,9 @@ def load(
         if cache is not None:
             found = [cache.get(frame, seed) for seed in range(draws)]
             row["denoised"] = found[0].denoised
-            if found[0].divergence is not None:
-                row["divergence"] = np.stack([estimate.divergence for estimate in found])
+            drawn = [e.divergence for e in found if e.divergence is not None]
+            if drawn:
+                row["divergence"] = np.stack(drawn)
             if found[0].probe is not None:
                 row["probe"], row["tangent"] = found[0].probe, found[0].tangent
         for name, value in row.items():
