@@ -10,7 +10,7 @@ How to use it: `progden_jax.guides`. What is not imported with the package: `pro
 
 __version__ = "0.1.0"
 
-from progden_jax import denoisers, metrics, transfer
+from progden_jax import combiner, denoisers, metrics, transfer
 from progden_jax.batch import denoise_batch
 from progden_jax.compilation import enable_compilation_cache
 from progden_jax.denoisers import Denoiser, FunctionDenoiser
@@ -59,6 +59,7 @@ __all__ = [
     "Skip",
     "Skipped",
     "closed_form_alpha",
+    "combiner",
     "denoise",
     "denoise_batch",
     "denoisers",

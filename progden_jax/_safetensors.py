@@ -17,6 +17,12 @@ DTYPES = ("float16", "float32")
 ENDING = ".safetensors"
 
 
+def shipped(folder: Path, prefix: str) -> dict[str, Path]:
+    """The weights in the folder whose names begin so, by the rest of their names."""
+    files = sorted(folder.glob(f"{prefix}*{ENDING}"))
+    return {file.stem.removeprefix(prefix): file for file in files}
+
+
 def write(
     path: str | os.PathLike[str], params: Any, metadata: Mapping[str, str], *, dtype: str
 ) -> None:

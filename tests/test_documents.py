@@ -15,10 +15,10 @@ from documents import DOCUMENTS, ROOT, blocks, commands
 
 import progden_jax as pd
 from progden_jax.cli import app
-from progden_jax.training import DenoiserConfig, MixerConfig, config
+from progden_jax.training import CombinerConfig, DenoiserConfig, MixerConfig, config
 
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-TRAINING = {"mixer": MixerConfig, "denoiser": DenoiserConfig}
+TRAINING = {"combiner": CombinerConfig, "mixer": MixerConfig, "denoiser": DenoiserConfig}
 
 each = pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.stem)
 

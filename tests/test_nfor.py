@@ -177,6 +177,21 @@ def test_halves_filter_each_other():
         SMALL.bind(small, halves=(a, b[:3]))
 
 
+def test_other_images_are_filtered_alike():
+    """The image itself as it is, and what is linear in the other."""
+    x = FRAME.color
+    others = jnp.stack([x, 2 * x + 1, FRAME.albedo])
+    f = SMALL.bind(FRAME)
+    found = f.filtered(x, others)
+    expected = f(x)
+    assert np.asarray(expected > 0).all()
+    np.testing.assert_allclose(found[0], expected, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(found[1], 2 * expected + 1, rtol=1e-3)
+    np.testing.assert_allclose(found[2], FRAME.albedo, atol=2e-2)
+    with pytest.raises(ValueError, match=r"images\[0\] has shape"):
+        f.filtered(x, others[:, :3])
+
+
 def test_prefiltered_features(noisy):
     truth = np.broadcast_to(np.where(np.arange(19) < 9, 0.2, 0.8)[None, :, None], (*SIZE, 3))
     noise = 0.1 * np.random.default_rng(6).normal(size=truth.shape)

@@ -9,7 +9,7 @@ import pytest
 from code_generation import as_for_users
 
 import progden_jax as pd
-from progden_jax import _safetensors, mixers
+from progden_jax import _safetensors, combiner, mixers
 from progden_jax.denoisers import files
 
 FILES = {path.stem: path for path in files.FOLDER.glob("*.safetensors")}
@@ -21,7 +21,8 @@ RECORDED: dict[str, list[float]] = {
     "mixer-unet-hdr": [0.739653, 0.603126, 0.712924, 0.731417, 0.222536, 0.483584],
     "unet-hdr": [0.0606872, 0.0305358, 0.0520162, 0.10864, 0.0451267, 0.0947322],
 }
-"""Means of red, green and blue, then one pixel: of a denoised crop, or of a mixer's α on it."""
+"""Means of red, green and blue, then one pixel: of a denoised crop, also a blurred one with a combiner behind
+it, or of a mixer's α on that."""
 
 
 @pytest.fixture(scope="module")
@@ -35,15 +36,28 @@ def mixed():
     return jax.jit(lambda mixer, *images: mixer(*images), compiler_options=as_for_users())
 
 
-def output(name: str, frame: pd.Frame, mixed) -> jax.Array:
+@pytest.fixture(scope="module")
+def denoised():
+    """The image of any denoiser, by one program for all of a kind."""
+    return jax.jit(
+        lambda denoiser, frame: denoiser.bind(frame)(frame.color), compiler_options=as_for_users()
+    )
+
+
+def blur(x):
+    return sum(jnp.roll(x, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)) / 9
+
+
+BLUR = pd.FunctionDenoiser(blur)
+
+
+def output(name: str, frame: pd.Frame, mixed, denoised) -> jax.Array:
+    if name.startswith("combiner-"):
+        return denoised(combiner.load(name.removeprefix("combiner-"), BLUR), frame)
     if not name.startswith("mixer-"):
-        run = jax.jit(
-            lambda denoiser, frame: denoiser.bind(frame)(frame.color),
-            compiler_options=as_for_users(),
-        )
-        return run(pd.denoisers.load(name), frame)
+        return denoised(pd.denoisers.load(name), frame)
     x, variance = frame.color, frame.variance
-    y = sum(jnp.roll(x, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)) / 9
+    y = blur(x)
     divergence = variance / 9
     risk = pd.sure(x, y, variance, divergence)
     mixer = pd.load_mixer(name.removeprefix("mixer-"))
@@ -53,6 +67,7 @@ def output(name: str, frame: pd.Frame, mixed) -> jax.Array:
 def test_every_file_is_recorded_and_found_by_name():
     assert set(FILES) == set(RECORDED)
     named = {*files.shipped(), *(f"mixer-{n}" for n in mixers.names() if n != mixers.CLOSED_FORM)}
+    named |= {f"combiner-{n}" for n in combiner.names()}
     assert named == set(FILES)
 
 
@@ -68,7 +83,7 @@ def test_small_and_with_its_origin(name):
 
 
 @pytest.mark.parametrize("name", sorted(FILES))
-def test_outputs_are_those_recorded(name, crop, mixed):
-    found = np.asarray(output(name, crop, mixed))
+def test_outputs_are_those_recorded(name, crop, mixed, denoised):
+    found = np.asarray(output(name, crop, mixed, denoised))
     summary = [*found.mean((0, 1)), *found[9, 21]]
     np.testing.assert_allclose(summary, RECORDED[name], rtol=1e-3, atol=1e-5)

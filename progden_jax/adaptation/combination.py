@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from progden_jax import _checks
-from progden_jax._convolution import same_convolution
+from progden_jax._neighbourhood import Shifted, some_outputs, weighted_sums
 from progden_jax.frame import Frame
 
 GUIDES = {"noisy": 3, "denoised": 3, "albedo": 3, "normal": 3, "depth": 1}
@@ -82,25 +82,16 @@ def combine(
     """
     _checks.image("guides", guides, channels=CHANNELS)
     _checks.odd_int("window", window)
-    height, width = guides.shape[:2]
-    # Planes, for loops over few channels are no vectors. The last is 1 inside the image: it sums the weights.
-    planes = jnp.concatenate([guides, jnp.ones_like(guides[..., :1])], axis=-1).transpose(2, 0, 1)
-    border = (window // 2, window // 2)
-    padded = jnp.pad(planes, ((0, 0), border, border))
+    # The last that is summed is 1 inside the image: it sums the weights. Depth only weighs.
+    ones = jnp.ones_like(guides[..., :1])
+    planes = jnp.concatenate([guides[..., :-1], ones, guides[..., -1:]], axis=-1).transpose(2, 0, 1)
 
-    @jax.checkpoint
-    def part(index: Array) -> Array:
-        start = (0, index // window, index % window)
-        there = jax.lax.dynamic_slice(padded, start, (CHANNELS + 1, height, width))
-        squares = (there[:CHANNELS] - planes[:CHANNELS]) ** 2
-        weight = weigh(index, jnp.stack(list(_by_guide(squares))))
-        return weight * jnp.concatenate([there[: CHANNELS - 1], there[-1:]])
+    def weights_of(index: Array, shifted: Shifted) -> Array:
+        squares = (shifted(index) - planes) ** 2
+        distances = jnp.concatenate([squares[: CHANNELS - 1], squares[CHANNELS:]])
+        return weigh(index, jnp.stack(list(_by_guide(distances))))[None]
 
-    def add(total: Array, index: Array) -> tuple[Array, None]:
-        return total + part(index), None
-
-    start = jnp.zeros((CHANNELS, height, width), guides.dtype)
-    total, _ = jax.lax.scan(add, start, jnp.arange(window**2))
+    total = weighted_sums(planes, weights_of, window=window, summed=CHANNELS)
     weights = jnp.maximum(total[-1], jnp.finfo(guides.dtype).tiny)
     means = (total[:-1] / weights).transpose(1, 2, 0)
     differences = guides[..., 3:12] - means[..., 3:]
@@ -141,7 +132,6 @@ def predicted(
 
     def weigh(index: Array, squared: Array) -> Array:
         del squared
-        one = jax.lax.dynamic_slice_in_dim(kernel, index, 1, axis=-1)
-        return jax.nn.softplus(same_convolution(features[None], one)[0, ..., 0] + bias[index])
+        return jax.nn.softplus(some_outputs(features[None], kernel, bias, index, 1)[0, 0])
 
     return weigh

@@ -13,6 +13,7 @@ from cyclopts import Parameter
 from progden_jax.cli._run import UsageError
 
 if TYPE_CHECKING:
+    from progden_jax.combiner import DeepCombiner
     from progden_jax.denoisers import NFOR, Network
     from progden_jax.divergence import Method
     from progden_jax.exr import Settings
@@ -127,6 +128,13 @@ class NetworkOptions:
             "nfor, regression without a network; by default OIDN's for the buffers in the file."
         ),
     ] = None
+    combiner: Annotated[
+        str | None,
+        Parameter(
+            help="Weights of a deep combiner, which combines the denoised image with the render: the name of "
+            "a denoiser that some are shipped for, or a .safetensors file."
+        ),
+    ] = None
     quality: Annotated[
         Quality | None,
         Parameter(
@@ -151,8 +159,13 @@ class NetworkOptions:
 
     def check(self) -> None:
         """Raise UsageError for what is wrong whatever the files hold."""
-        from progden_jax import denoisers
+        from progden_jax import combiner, denoisers
 
+        if self.combiner is not None:
+            try:
+                combiner.read(self.combiner)
+            except ValueError as error:
+                raise UsageError(f"--combiner: {error}") from None
         named = "--denoiser" if self.denoiser else "--weights" if self.weights else None
         if self.denoiser and self.weights:
             raise UsageError("--denoiser and --weights both name a network: give one of them.")
@@ -198,8 +211,16 @@ class NetworkOptions:
             raise UsageError(f"--exposure is {self.exposure!r}, expected auto or a number above 0.")
         return value
 
-    def load(self, frame: "Frame") -> "tuple[Frame, Network | NFOR]":
-        """The frame as the network is to see it (prefiltered if asked for), and the network."""
+    def load(self, frame: "Frame") -> "tuple[Frame, Network | NFOR | DeepCombiner]":
+        """The frame as the network is to see it (prefiltered if asked for), and the denoiser."""
+        from progden_jax import combiner
+
+        frame, denoiser = self._load_network(frame)
+        if self.combiner is None:
+            return frame, denoiser
+        return frame, combiner.load(self.combiner, denoiser)
+
+    def _load_network(self, frame: "Frame") -> "tuple[Frame, Network | NFOR]":
         from progden_jax import denoisers
 
         quality, exposure = self.quality or "balanced", self.exposure_value()

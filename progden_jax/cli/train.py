@@ -14,11 +14,12 @@ if TYPE_CHECKING:
     from progden_jax.training import RunConfig, Task
     from progden_jax.training.evaluation import Scores
 
-HELP = """Train a mixing network or a denoiser on renders with references.
+HELP = """Train a mixing network, a denoiser or a combiner on renders with references.
 
 ```
 progden train mixer --config cpu --data renders/ --output runs/hdr
 progden train denoiser --config cpu --set inputs=['albedo','normal'] --data renders/ -o runs/unet
+progden train combiner --config cpu --set denoiser=nfor --data renders/ -o runs/combiner
 progden train mixer --config mine.toml --set denoiser=oidn-hdr-alb-nrm -o runs/aux
 tensorboard --logdir runs
 ```
@@ -35,10 +36,16 @@ _DENOISER_HELP = """Train a denoiser; the best weights so far are OUTPUT/weights
 The same command goes on where it was killed, and comes to the same weights.
 """
 
+_COMBINER_HELP = """Train a deep combiner for one denoiser; the best so far are OUTPUT/weights.safetensors.
+
+The same command goes on where it was killed, and comes to the same weights. Give them to
+`progden denoise --combiner`. Denoised images are kept in a cache folder between runs.
+"""
+
 _CONFIG = Parameter(
-    help="A named configuration (paper, cpu, gpu, smoke; those that made what is shipped: for mixers "
-    "multiscale, for denoisers small, kpcn and residual-small; for denoisers also residual, as its paper has "
-    "it) or a file, .toml or .yaml; it may begin with "
+    help="A named configuration (paper, cpu, smoke, and for mixers and denoisers gpu; those that made "
+    "what is shipped: for mixers multiscale, for denoisers small, kpcn, residual-small; for denoisers also "
+    "residual, as its paper has it) or a file, .toml or .yaml; it may begin with "
     'base = "cpu" and change fields [default: cpu].'
 )
 _DATA = Parameter(
@@ -100,6 +107,31 @@ def denoiser(
 
 _ = app.command(
     denoiser, help=_DENOISER_HELP, usage="Usage: progden train denoiser -o OUTPUT [OPTIONS]"
+)
+
+
+def combiner(
+    *,
+    output: Annotated[Path, _OUTPUT],
+    config: Annotated[str, _CONFIG] = "cpu",
+    data: Annotated[tuple[Path, ...], _DATA] = (),
+    set: Annotated[tuple[str, ...], _SET] = (),
+    until: Annotated[int | None, _UNTIL] = None,
+    cache: Annotated[Path | None, _CACHE] = None,
+    json: Annotated[bool, _JSON] = False,
+) -> int:
+    from progden_jax.training import CombinerConfig, CombinerTask
+
+    chosen = _load(CombinerConfig, config, data, set)
+
+    def task(progress: Callable[[int, int], None]) -> "Task":
+        return CombinerTask(chosen, cache_folder=cache, progress=progress)
+
+    return _train(task, output, until=until, json=json)
+
+
+_ = app.command(
+    combiner, help=_COMBINER_HELP, usage="Usage: progden train combiner -o OUTPUT [OPTIONS]"
 )
 
 
@@ -188,7 +220,7 @@ class _Report:
 def _summary(scores: "Scores") -> str:
     """Means over spp of each image's errors, on one line."""
     parts = []
-    for metric in ("rmse", "smape"):
+    for metric in next(iter(scores.table.values())):
         means = []
         for image, by_metric in scores.table.items():
             values = by_metric[metric].values()

@@ -106,5 +106,6 @@ class _Constant:
 
 def passable(denoiser: Denoiser) -> Any:
     """The denoiser in a form that ``jax.jit`` takes as an argument."""
-    is_leaf = jax.tree_util.treedef_is_leaf(jax.tree.structure(denoiser))
+    # Not treedef_is_leaf, which takes a pytree of settings alone, such as NFOR, for a leaf.
+    is_leaf = jax.tree.structure(denoiser) == jax.tree.structure(0)
     return _Constant(denoiser) if is_leaf else denoiser

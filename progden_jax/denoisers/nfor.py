@@ -162,12 +162,12 @@ class NFOR:
         return self.windows.reach + chosen
 
 
-_FEATURE = {
-    "albedo": lambda albedo: albedo,
-    "normal": lambda normal: normal,
-    # Ratios of distances matter, whatever the scene's unit; 0 is a ray that hits nothing.
-    "depth": lambda depth: jnp.where(depth > 0, jnp.log(jnp.where(depth > 0, depth, 1)), 0),
-}
+def log_depth(depth: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Ratios of distances matter, whatever the scene's unit; 0 is a ray that hits nothing, and stays 0."""
+    return jnp.where(depth > 0, jnp.log(jnp.where(depth > 0, depth, 1)), 0)
+
+
+_FEATURE = {"albedo": lambda albedo: albedo, "normal": lambda normal: normal, "depth": log_depth}
 
 
 @jax.jit
@@ -195,9 +195,18 @@ class BoundNFOR(Bounded):
         _checks.same_shape("x", x, "the frame's variance", self.variance)
         return _run(self, x)
 
+    def filtered(
+        self, x: Float[Array, "h w 3"], images: Float[Array, "b h w 3"]
+    ) -> Float[Array, "b h w 3"]:
+        """Other images, filtered as x is: by the same kernels and bandwidths; at least 0."""
+        _checks.image("x", x)
+        _checks.images("images", images)
+        _checks.same_shape("images[0]", images[0], "x", x)
+        return _run(self, x, images)
+
 
 @jax.jit
-def _run(f: BoundNFOR, x: Array) -> Array:
+def _run(f: BoundNFOR, x: Array, others: Array | None = None) -> Array:
     inside = inside_of(x.shape[:2], f.valid)
     if inside is None:
         inside = jnp.ones((*x.shape[:2], 1), bool)
@@ -211,6 +220,10 @@ def _run(f: BoundNFOR, x: Array) -> Array:
         half = shown(f.difference)
         images, guides = (jnp.stack((color + s * half, color - s * half)) for s in (1, -1))
         variance = 2 * variance
+    if others is not None:
+        beside = jnp.concatenate([shown(image) for image in others], -1)
+        beside = jnp.broadcast_to(beside, (len(images), *beside.shape))
+        images = jnp.concatenate([images, beside], -1)
     settings = f.denoiser
     found = lax.map(
         lambda pair: regress(
@@ -228,12 +241,15 @@ def _run(f: BoundNFOR, x: Array) -> Array:
     )
     candidates, leverage = (a.mean(0) for a in found)
     if len(settings.bandwidths) > 1:
-        risks = (candidates - x) ** 2 + 2 * f.variance * leverage[..., None]
+        risks = (candidates[..., :3] - x) ** 2 + 2 * f.variance * leverage[..., None]
         share = lax.stop_gradient(_least_risk(jnp.where(inside, risks, 0), inside))
         mixed = (share * candidates).sum(0)
     else:
         mixed = candidates[0]
-    return jnp.where(inside & (mixed > 0), mixed, 0)
+    result = jnp.where(inside & (mixed > 0), mixed, 0)
+    if others is None:
+        return result
+    return jnp.stack(jnp.split(result[..., 3:], len(others), -1))
 
 
 def _least_risk(risks: Float[Array, "k h w 3"], inside: Array) -> Float[Array, "k h w 1"]:

@@ -9,10 +9,12 @@ from typing import Any, cast
 import jax
 import jax.numpy as jnp
 
-from progden_jax import adaptation, denoisers, mixers
+from progden_jax import adaptation, combiner, denoisers, mixers
 from progden_jax._fingerprint import fingerprint
+from progden_jax.combiner import DeepCombiner
 from progden_jax.denoisers import Denoiser, FunctionDenoiser
-from progden_jax.evaluation.settings import AUTO, DEFAULT, Settings
+from progden_jax.denoisers._base import passable
+from progden_jax.evaluation.settings import AUTO, DEFAULT, NONE, Settings
 from progden_jax.frame import Frame
 from progden_jax.mixing import Mixer
 
@@ -25,7 +27,15 @@ def denoiser_for(frame: Frame, settings: Settings) -> Denoiser:
     name = settings.denoiser
     if name == AUTO:
         name = denoisers.for_frame(frame).name
-    return load_denoiser(name, settings.precision)
+    return _named(name, settings)
+
+
+def _named(name: str, settings: Settings) -> Denoiser:
+    denoiser = load_denoiser(name, settings.precision)
+    if settings.combiner == NONE:
+        return denoiser
+    weights = _read_combiner(settings.combiner)
+    return DeepCombiner(weights.params, passable(denoiser), weights.network)
 
 
 def adapted(frame: Frame, denoiser: Denoiser, settings: Settings) -> Denoiser:
@@ -76,9 +86,12 @@ def content(settings: Settings) -> str:
     if settings.image == "render":
         return ""
     parts = [_denoiser_content(settings.denoiser, settings.precision)]
+    if settings.combiner != NONE:
+        weights = _read_combiner(settings.combiner)
+        parts.append(fingerprint(weights.params, repr(weights.network)))
     if settings.image == "mix" and settings.mixer != mixers.CLOSED_FORM:
         chosen = _AUTO if settings.denoiser == AUTO else (settings.denoiser,)
-        found = [mixer_for(load_denoiser(n, settings.precision), settings) for n in chosen]
+        found = [mixer_for(_named(n, settings), settings) for n in chosen]
         parts += [fingerprint(_described(mixer)) for mixer in found]
     return fingerprint(parts)
 
@@ -94,6 +107,8 @@ def trained_as(settings: Settings) -> dict[str, Any]:
         return {}
     return {f"mixer.trained.{n}": trained[n] for n in ("method", "probes", "seed") if n in trained}
 
+
+_read_combiner = functools.lru_cache(maxsize=8)(combiner.read)
 
 _load_mixer = functools.lru_cache(maxsize=8)(mixers.load)
 

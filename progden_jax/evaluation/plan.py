@@ -10,11 +10,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import progden_jax
-from progden_jax.denoisers import names as denoiser_names
 from progden_jax.evaluation import parts
 from progden_jax.evaluation import settings as names
-from progden_jax.evaluation.settings import AUTO, Settings
-from progden_jax.mixers import names as mixer_names
+from progden_jax.evaluation.settings import Settings
 from progden_jax.training import config
 from progden_jax.training.config import Meaning
 from progden_jax.training.index import Item, index
@@ -35,7 +33,11 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 DEFAULT_METHODS = ("render", "denoised", "mix", "closed-form")
 
-_FILES = {"denoiser": (".tza", ".safetensors"), "mixer": (".safetensors",)}
+_FILES = {
+    "denoiser": (".tza", ".safetensors"),
+    "combiner": (".safetensors",),
+    "mixer": (".safetensors",),
+}
 """Settings that may be paths, and what these end in."""
 
 
@@ -240,11 +242,10 @@ def _mapping(value: Any, where: str) -> dict[str, Any]:
 
 def _anchored(values: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Paths of files made absolute; names of what is shipped stay."""
-    shipped = {"denoiser": (AUTO, *denoiser_names()), "mixer": mixer_names()}
     found = dict(values)
     for name, endings in _FILES.items():
         value = found.get(name)
-        if not isinstance(value, str) or value in shipped[name]:
+        if not isinstance(value, str):
             continue
         if value.endswith(endings) or (name == "denoiser" and ".py:" in value):
             found[name] = str((folder / value).resolve())

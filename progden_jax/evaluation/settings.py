@@ -22,7 +22,7 @@ DEFAULT = "default"
 """The mixer that `mixers.default_for` chooses."""
 
 NONE = "none"
-"""No estimate of the divergence, so no SURE; or no adaptation."""
+"""No estimate of the divergence, so no SURE; no combiner; no adaptation."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +33,7 @@ class Settings:
     denoiser: str = (
         AUTO  # a name, a file of weights, FILE.py:FUNCTION, or auto: OIDN's by the buffers
     )
+    combiner: str = NONE  # a name or a file of weights of a deep combiner behind it; or none
     precision: str = "highest"  # of the denoiser's products
     adaptation: Literal["none", "sure", "post-correct"] = "none"  # of the denoiser to the render
     fitting: Adaptation = dataclasses.field(default_factory=Adaptation)
@@ -80,7 +81,7 @@ class Settings:
 
     def program(self) -> tuple[Any, ...]:
         """What determines the compiled program that makes these."""
-        return (self.denoiser, self.precision, self.method(), self.fit())
+        return (self.denoiser, self.combiner, self.precision, self.method(), self.fit())
 
     def fit(self) -> Adaptation | PostCorrection | None:
         """How the denoiser is adapted, if it is."""
@@ -91,6 +92,8 @@ class Settings:
         used = ["image"]
         if self.image != "render":
             used += ["denoiser", "precision", "estimator"]
+            if self.combiner != NONE:
+                used.append("combiner")
             # Runs from before there was any stay as they are.
             used += ["adaptation"] if self.adaptation != NONE else []
             probed = self.estimator not in (NONE, "exact")
@@ -212,4 +215,4 @@ def _short(value: str) -> str:
 def _word(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    return f"{value:g}" if isinstance(value, float) else _short(str(value))

@@ -95,11 +95,7 @@ class NetworkMixer:
 
 def names() -> tuple[str, ...]:
     """The names that `load` knows: the closed form, and the denoisers that a mixer is shipped for."""
-    shipped = sorted(p.name for p in _FOLDER.glob(f"{_PREFIX}*{_safetensors.ENDING}"))
-    return (
-        CLOSED_FORM,
-        *(n.removeprefix(_PREFIX).removesuffix(_safetensors.ENDING) for n in shipped),
-    )
+    return (CLOSED_FORM, *_safetensors.shipped(_FOLDER, _PREFIX))
 
 
 def load(name: str | os.PathLike[str]) -> Mixer:
@@ -165,7 +161,7 @@ def save_mixer(
 
 @functools.lru_cache(maxsize=8)
 def _shipped(name: str) -> NetworkMixer:
-    return _read(_FOLDER / f"{_PREFIX}{name}{_safetensors.ENDING}")
+    return _read(_safetensors.shipped(_FOLDER, _PREFIX)[name])
 
 
 def _read(path: Path) -> NetworkMixer:

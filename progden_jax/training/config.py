@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, cast
 
 from progden_jax import _checks
-from progden_jax.training.losses import SUPERVISED
+from progden_jax.training.losses import LOG_RELMSE, SUPERVISED
 
 Meaning = Literal["mean", "samples", "std", "second-moment"]
 """What variance channels hold, see `progden_jax.read_exr`."""
@@ -21,7 +21,7 @@ _FOLDER = Path(__file__).parent / "configs"
 
 @dataclasses.dataclass(frozen=True)
 class RunConfig:
-    """What training a mixer and training a denoiser have in common."""
+    """What training a mixer, a denoiser and a combiner have in common."""
 
     steps: int  # of the optimiser, the whole one-cycle schedule
     data: tuple[str, ...] = ()  # folders of NAME_SSSSSSspp.exr, searched with their subfolders
@@ -67,7 +67,7 @@ class RunConfig:
         for name in ("peak_rate", "start_divisor", "end_divisor"):
             _within(self, name, 0, float("inf"), "a number above 0", closed=False)
         _check_stages(self.rates, self.rate_steps)
-        _checks.choice("loss", self.loss, (*SUPERVISED, "log-errors", "sure"))
+        _checks.choice("loss", self.loss, (*SUPERVISED, LOG_RELMSE, "log-errors", "sure"))
         _checks.choice("precision", self.precision, ("default", "high", "highest"))
 
 
@@ -111,6 +111,21 @@ class DenoiserConfig(RunConfig):
         _checks.choice("weights_dtype", self.weights_dtype, ("float32", "float16"))
         for role in self.inputs:
             _checks.choice("inputs", role, ("albedo", "normal", "depth", "variance"))
+
+
+@dataclasses.dataclass(frozen=True)
+class CombinerConfig(RunConfig):
+    """How to train a deep combiner."""
+
+    denoiser: str = "nfor"  # name or weights file of the denoiser whose images are combined
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # of its KernelNetwork
+    loss: str = "relmse"  # as the paper; smape, relmse, l1, logl1, or log-relmse
+    weights_dtype: str = "float32"  # of the weights file; float16 halves it, to three digits
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _checks.choice("loss", self.loss, (*SUPERVISED, LOG_RELMSE))
+        _checks.choice("weights_dtype", self.weights_dtype, ("float32", "float16"))
 
 
 Config = TypeVar("Config", bound=RunConfig)
@@ -212,7 +227,10 @@ def _values(
 
 
 def _folder(kind: type[RunConfig]) -> Path:
-    return _FOLDER / ("mixer" if issubclass(kind, MixerConfig) else "denoiser")
+    for known in (MixerConfig, CombinerConfig):
+        if issubclass(kind, known):
+            return _FOLDER / known.__name__.removesuffix("Config").lower()
+    return _FOLDER / "denoiser"
 
 
 def _toml(path: Path) -> Any:

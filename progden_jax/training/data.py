@@ -41,7 +41,7 @@ def load(
 
     Parameters
     ----------
-    cache : gives denoised images and divergences; None leaves them out.
+    cache : gives denoised images, and divergences if it has a method; None leaves them out.
     draws : divergences of so many seeds per render.
     auxiliary : buffers to take besides, of albedo, normal and depth.
 
@@ -75,11 +75,13 @@ def load(
         for name in auxiliary:
             row[name] = getattr(frame, name)
             if row[name] is None:
-                raise ValueError(f"{item.path} has no {name}, which this denoiser takes.")
+                raise ValueError(f"{item.path} has no {name}, which this network takes.")
         if cache is not None:
             found = [cache.get(frame, seed) for seed in range(draws)]
             row["denoised"] = found[0].denoised
-            row["divergence"] = np.stack([estimate.divergence for estimate in found])
+            drawn = [e.divergence for e in found if e.divergence is not None]
+            if drawn:
+                row["divergence"] = np.stack(drawn)
             if found[0].probe is not None:
                 row["probe"], row["tangent"] = found[0].probe, found[0].tangent
         for name, value in row.items():

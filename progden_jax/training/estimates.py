@@ -27,13 +27,13 @@ _VERSION = 3
 
 
 class Estimate(NamedTuple):
-    """y = f(x), and the divergence σ²·∂f/∂x as estimated, (H, W, 3) each.
+    """y = f(x), and the divergence σ²·∂f/∂x as estimated, (H, W, 3) each; None without a method.
 
     `probe` and `tangent`, where asked for, are σ·s of other random signs s, and J·(σ·s).
     """
 
     denoised: Float[np.ndarray, "h w 3"]
-    divergence: Float[np.ndarray, "h w 3"]
+    divergence: Float[np.ndarray, "h w 3"] | None = None
     probe: Float[np.ndarray, "h w 3"] | None = None
     tangent: Float[np.ndarray, "h w 3"] | None = None
 
@@ -48,7 +48,7 @@ class EstimateCache:
 
     Parameters
     ----------
-    denoiser, method : what estimates.
+    denoiser, method : what estimates; no method: denoised images alone.
     folder : where to keep them, made if missing; by default `default_folder()`. Entries that are damaged
         are computed again. It may be deleted at any time. Nothing is kept for a denoiser that is a Python
         function, which cannot be told from another in the next process.
@@ -58,7 +58,7 @@ class EstimateCache:
     def __init__(
         self,
         denoiser: Denoiser,
-        method: Method,
+        method: Method | None,
         folder: str | os.PathLike[str] | None = None,
         *,
         tangents: bool = False,
@@ -67,7 +67,7 @@ class EstimateCache:
         self.hits = self.misses = 0
         self._denoiser = denoiser
         self._method = method
-        self._fields = Estimate._fields if tangents else Estimate._fields[:2]
+        self._fields = Estimate._fields[: 1 if method is None else 4 if tangents else 2]
         kind, structure = type(denoiser).__qualname__, str(jax.tree.structure(denoiser))
         self.stores = " at 0x" not in structure
         self._settings = fingerprint(
@@ -112,6 +112,8 @@ def _estimate(
     frame: Frame, denoiser: Denoiser, key: jax.Array, *, method: Any, tangents: bool
 ) -> tuple[Array, ...]:
     f = denoiser.bind(frame)
+    if method is None:
+        return (f(frame.color),)
     assert frame.variance is not None
     y, divergence, *_ = method.evaluate(f, frame.color, frame.variance, key)
     if not tangents:

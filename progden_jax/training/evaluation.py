@@ -87,14 +87,16 @@ class HeldOut:
 
 
 def tabulate(
-    items: Sequence[Item], errors: Mapping[str, Float[np.ndarray, "n 2"]]
+    items: Sequence[Item],
+    errors: Mapping[str, Float[np.ndarray, "n m"]],
+    names: Sequence[str] = ("rmse", "smape"),
 ) -> dict[str, dict[str, dict[int, float]]]:
-    """Image -> metric -> spp -> mean over scenes, of errors as `errors` gives them."""
+    """Image -> metric -> spp -> mean over scenes, of errors as `errors` gives them, or of these names."""
     spp = np.asarray([item.spp for item in items])
     return {
         image: {
             metric: {int(n): float(values[spp == n, column].mean()) for n in np.unique(spp)}
-            for column, metric in enumerate(("rmse", "smape"))
+            for column, metric in enumerate(names)
         }
         for image, values in errors.items()
     }

@@ -47,6 +47,20 @@ def log_errors(
     )
 
 
+LOG_RELMSE = "log-relmse"
+"""The name of `log_relmse` in configurations."""
+
+
+def log_relmse(
+    z: Float[Array, "*b h w 3"], y: Float[Array, "*b h w 3"], reference: Float[Array, "*b h w 3"]
+) -> Float[Array, "*b"]:
+    """Of each image the logarithm of its relative MSE over that of y, so that noisy and clean images count
+    alike; a twentieth is added, so that one that is nearly right does not outweigh all others."""
+    axes = (-3, -2, -1)
+    error, before = (relmse_of_values(image, reference).mean(axes) for image in (z, y))
+    return jnp.log(error / jnp.maximum(before, jnp.finfo(z.dtype).tiny) + 0.05)
+
+
 SUPERVISED: dict[str, Loss] = {
     "smape": smape_of_values,
     "relmse": relmse_of_values,

@@ -15,7 +15,7 @@ from progden_jax.mixers import NetworkMixer, build, save_mixer
 from progden_jax.mixers.architectures import Architecture, Params
 from progden_jax.sure import sure
 from progden_jax.training import augment, data, evaluation, losses
-from progden_jax.training.config import MixerConfig
+from progden_jax.training.config import CombinerConfig, MixerConfig
 from progden_jax.training.estimates import EstimateCache
 from progden_jax.tstatistic import t_bound
 
@@ -59,11 +59,7 @@ class MixerTask:
         self.architecture = build(config.architecture, config.options)
         if denoiser is None:
             denoiser = denoisers.load(config.denoiser)
-        if config.exposure_stops and not follows_exposure(denoiser):
-            raise ValueError(
-                f"exposure_stops is {config.exposure_stops}, but {config.denoiser} does not follow exposure "
-                "(f(s·x) is not s·f(x)), so its images in the cache cannot be rescaled: set it to 0."
-            )
+        check_exposure(config, denoiser)
         tangents = config.loss == "sure" and config.sure_derivative == "probe"
         method = build_method(config)
         self.cache = EstimateCache(denoiser, method, cache_folder, tangents=tangents)
@@ -177,6 +173,15 @@ def build_method(config: MixerConfig) -> Method:
     if config.method not in METHODS:
         raise ValueError(f"method is {config.method!r}, expected one of {', '.join(METHODS)}.")
     return METHODS[config.method](config.probes)
+
+
+def check_exposure(config: MixerConfig | CombinerConfig, denoiser: Any) -> None:
+    """Raise ValueError if exposures are changed, and cached images of the denoiser do not follow."""
+    if config.exposure_stops and not follows_exposure(denoiser):
+        raise ValueError(
+            f"exposure_stops is {config.exposure_stops}, but {config.denoiser} does not follow exposure "
+            "(f(s·x) is not s·f(x)), so its images in the cache cannot be rescaled: set it to 0."
+        )
 
 
 def follows_exposure(denoiser: Any) -> bool:
