@@ -37,9 +37,8 @@ The same command goes on where it was killed, and comes to the same weights.
 
 _CONFIG = Parameter(
     help="A named configuration (paper, cpu, gpu, smoke; those that made what is shipped: for mixers "
-    "multiscale, for denoisers small, kpcn and residual-small; for denoisers also residual, as its paper has "
-    "it) or a file, .toml or .yaml; it may begin with "
-    'base = "cpu" and change fields [default: cpu].'
+    "multiscale, for denoisers small and kpcn; for denoisers also residual and residual-small) or a file, "
+    '.toml or .yaml; it may begin with base = "cpu" and change fields [default: cpu].'
 )
 _DATA = Parameter(
     consume_multiple=True,
