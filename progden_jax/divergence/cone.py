@@ -78,6 +78,11 @@ class Sweep:
                     value = parts[0] if len(parts) == 1 else parts[0] + parts[1]
                 case g.Filter():
                     value = self._filter(index, node, window, values)
+                case g.BatchNorm():
+                    raise ValueError(
+                        f"layer {node.layer} is normalised over a batch, as in training only: save the network, "
+                        "which folds that into its weights."
+                    )
             values[index] = value
         last = values[len(plan.nodes) - 1]
         return last.reshape(-1, 3, last.shape[-1])
