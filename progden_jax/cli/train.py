@@ -44,8 +44,8 @@ The same command goes on where it was killed, and comes to the same weights. Giv
 
 _CONFIG = Parameter(
     help="A named configuration (paper, cpu, smoke, and for mixers and denoisers gpu; those that made "
-    "what is shipped: for mixers multiscale, for denoisers small, and kpcn; for denoisers also "
-    "residual, as its paper has it) or a file, .toml or .yaml; it may begin with "
+    "what is shipped: for mixers multiscale, for denoisers small and kpcn; for denoisers also "
+    "residual and residual-small) or a file, .toml or .yaml; it may begin with "
     'base = "cpu" and change fields [default: cpu].'
 )
 _DATA = Parameter(

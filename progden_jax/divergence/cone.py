@@ -80,8 +80,8 @@ class Sweep:
                     value = self._filter(index, node, window, values)
                 case g.BatchNorm():
                     raise ValueError(
-                        f"layer {node.layer} is normalised over a batch, as in training only: save the network, "
-                        "which folds that into its weights."
+                        f"layer {node.layer} is normalised over a batch, as in training only: save the "
+                        "network, which folds that into its weights."
                     )
             values[index] = value
         last = values[len(plan.nodes) - 1]
