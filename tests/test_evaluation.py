@@ -551,7 +551,8 @@ def test_peak_memory(monkeypatch):
     taken = Peak()
     (np.ones(2**23) * 2).sum()
     told = taken.read()
-    assert told is None or 2**26 <= told < 2**28
+    # 2**26 bytes; half of it is allowed for, as other threads may free some meanwhile.
+    assert told is None or 2**25 <= told < 2**28
 
     class Device:
         told = ({"bytes_in_use": 10, "peak_bytes_in_use": 50},) * 2 + (

@@ -13,6 +13,7 @@ import numpy as np
 import progden_jax as pd
 from experiments import _common
 from progden_jax.adaptation import pooled
+from progden_jax.frame import centre
 
 SPP = (32, 128, 512)
 POOL = 5
@@ -28,7 +29,7 @@ def main() -> None:
     arguments.output.mkdir(parents=True, exist_ok=True)
     names = _common.scenes(arguments.data, arguments.scenes)
     for name, spp, frame, reference in _common.series(arguments.data, names, arguments.spp):
-        frame, reference = (_common.centre(f, arguments.crop) for f in (frame, reference))
+        frame, reference = (centre(f, arguments.crop) for f in (frame, reference))
         if arguments.normal:
             frame, reference = as_normal(frame, reference, seed=spp)
         for count, image in ((spp, frame), (_common.REFERENCE_SPP, reference)):

@@ -114,8 +114,9 @@ def relative_to(
 def worst(rows: Sequence[Row], metric: str, over: Collection[str]) -> dict[str, Worst]:
     """The largest ratio of a method's value to the least of those of `over` on the same render.
 
-    Above 1 the method is somewhere worse than each of them, whatever the means say. Renders where the values
-    are not all there and above 0 are left out, and methods without any.
+    Of a metric that is better the less it is: above 1 the method is somewhere worse than each of them,
+    whatever the means say. Renders where the values are not all there and above 0 are left out, and methods
+    without any.
     """
     least: dict[tuple[str, int], list[float]] = {}
     for row in rows:

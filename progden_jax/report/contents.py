@@ -21,6 +21,7 @@ METRICS = {
     "mse": "MSE",
     "sure": "SURE",
     "denoised_mse": "MSE of denoised",
+    "risk": "estimate of MSE",
     "seconds": "seconds",
 }
 """What tables and plots show, by its name in the document; of all of them less is better."""
