@@ -704,7 +704,7 @@ def test_denoiser_configurations(folder):
     for changes, message in (
         ({"architecture": "vit"}, "architecture is 'vit', expected one of 'unet', 'kpcn'"),
         ({"options": {"depth": 2}}, "options is {'depth': 2}: .*depth"),
-        ({"inputs": ["albedo"]}, "has no albedo, which this denoiser takes"),
+        ({"inputs": ["albedo"]}, "has no albedo, which this network takes"),
         (
             {"inputs": ["depth"]},
             "inputs is 'depth', expected one of 'albedo', 'normal', 'variance'",
