@@ -12,7 +12,7 @@ import numpy as np
 
 import progden_jax as pd
 from experiments import _common
-from progden_jax.adaptation import pooled
+from progden_jax._windows import box_sum
 
 SPP = (32, 128, 512)
 POOL = 5
@@ -38,11 +38,13 @@ def main() -> None:
 
 def as_normal(frame: pd.Frame, reference: pd.Frame, *, seed: int) -> tuple[pd.Frame, pd.Frame]:
     """The reference with noise of the frame's variance, pooled, and the reference as the truth."""
-    made = pooled(frame, POOL)
-    variance = np.asarray(made.variance)
+    inside = np.ones_like(frame.variance)
+    variance = np.asarray(box_sum(frame.variance, POOL) / box_sum(inside, POOL))
     noise = np.random.default_rng(seed).normal(size=variance.shape) * np.sqrt(variance)
     color = (np.asarray(reference.color) + noise).astype(np.float32)
-    return made.replace(color=color), reference.replace(variance=np.zeros_like(variance))
+    return frame.replace(color=color, variance=variance), reference.replace(
+        variance=np.zeros_like(variance)
+    )
 
 
 if __name__ == "__main__":

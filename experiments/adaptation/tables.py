@@ -54,8 +54,7 @@ def adaptation(row: Row) -> str:
     told = row.settings
     kind = told.get("adaptation", "none")
     if kind == "sure":
-        pool = told["adaptation.pool"]
-        return "SURE" if pool == 1 else f"SURE, variances over {pool}×{pool}"
+        return "SURE" if told["adaptation.covariance"] else "SURE, channels as if independent"
     if kind == "post-correct":
         names = {(False, False): "A", (False, True): "B", (True, False): "C", (True, True): "D"}
         setting = names[told["correction.refined"], told["correction.bilateral"]]
