@@ -399,7 +399,7 @@ def test_noise_that_channels_share():
     frame = pd.Frame(
         np.float32(1 + sigma * noise), np.float32(np.broadcast_to(sigma**2, noise.shape))
     )
-    found = jax.jit(_noise.correlation)(frame, jnp.ones_like(frame.color))
+    found = jax.jit(_noise.correlation)(frame)
     assert abs(found - 0.6) < 0.02
     mixing = np.float32(rng.normal(size=(3, 3)))
     shared = jnp.float32(0.6)

@@ -8,6 +8,7 @@ pixels: then all that Stein's estimate assumes holds, and the reference is the t
 
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 
 import progden_jax as pd
@@ -38,7 +39,8 @@ def main() -> None:
 
 def as_normal(frame: pd.Frame, reference: pd.Frame, *, seed: int) -> tuple[pd.Frame, pd.Frame]:
     """The reference with noise of the frame's variance, pooled, and the reference as the truth."""
-    inside = np.ones_like(frame.variance)
+    assert frame.variance is not None
+    inside = jnp.ones_like(frame.variance)
     variance = np.asarray(box_sum(frame.variance, POOL) / box_sum(inside, POOL))
     noise = np.random.default_rng(seed).normal(size=variance.shape) * np.sqrt(variance)
     color = (np.asarray(reference.color) + noise).astype(np.float32)

@@ -25,8 +25,8 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("run", type=Path, nargs="+", help="folders that `progden sweep` wrote")
-    for run in parser.parse_args().run:
-        print(f"{run.name}\n\n{table(evaluation.rows(run))}\n")
+    runs = parser.parse_args().run
+    print(table([row for run in runs for row in evaluation.rows(run)]))
 
 
 def table(rows: list[Row]) -> str:

@@ -64,7 +64,8 @@ class Task:
 
 def task_of(denoiser: Any, frame: Frame, chosen: _leaves.Numbers, probes: int) -> Task:
     """SURE over y² + 0.01 + σ² is to be lowered, y the denoised image as it is."""
-    return Task(denoiser, frame, *_before(denoiser, frame), chosen, probes)
+    exposure, scale, shared = _before(denoiser, frame)
+    return Task(denoiser, frame, exposure, scale, shared, chosen, probes)
 
 
 @jax.jit
@@ -72,7 +73,7 @@ def _before(denoiser: Any, frame: Frame) -> tuple[Any, Array, Array]:
     exposure = exposure_of(denoiser, frame)
     y = bind(denoiser, frame, exposure)(frame.color)
     scale = 1 / (y**2 + 0.01 + cast(Array, frame.variance))
-    return exposure, scale, _noise.correlation(frame, y)
+    return exposure, scale, _noise.correlation(frame)
 
 
 @jax.jit

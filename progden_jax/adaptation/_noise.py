@@ -14,22 +14,24 @@ from progden_jax.divergence._base import Evaluation, accumulate
 from progden_jax.frame import Frame
 
 _OUTLIER = 3.0
-"""Standard deviations beyond which a residual counts as so many."""
+"""Standard deviations beyond which a difference counts as so many."""
 
 
-def correlation(frame: Frame, denoised: Float[Array, "h w 3"]) -> Float[Array, ""]:
+def correlation(frame: Frame) -> Float[Array, ""]:
     """Of the noise of two channels of a pixel: the mean over pairs, pixels counting alike, in [0, 1].
 
-    Taken from render minus denoised image. What that lost of the picture counts as noise, which makes the
+    Taken from differences of neighbours. What they have of the picture counts as noise, which makes the
     correlation rather too large.
     """
     variance = cast(Array, frame.variance)
-    noisy = variance > 0
-    scale = jnp.where(noisy, safe_sqrt(jnp.where(noisy, variance, 1)), 1)
-    residual = jnp.where(noisy, (frame.color - denoised) / scale, 0).clip(-_OUTLIER, _OUTLIER)
-    squares = (residual**2).sum()
+    both = variance[:, 1:] + variance[:, :-1]
+    noisy = both > 0
+    scale = jnp.where(noisy, jnp.sqrt(jnp.where(noisy, both, 1)), 1)
+    difference = frame.color[:, 1:] - frame.color[:, :-1]
+    parts = jnp.where(noisy, difference / scale, 0).clip(-_OUTLIER, _OUTLIER)
+    squares = (parts**2).sum()
     # (r + g + b)² − r² − g² − b² is twice the sum over the three pairs.
-    pairs = (residual.sum(-1) ** 2).sum() - squares
+    pairs = (parts.sum(-1) ** 2).sum() - squares
     return jnp.where(squares > 0, pairs / (2 * jnp.where(squares > 0, squares, 1)), 0).clip(0, 1)
 
 
