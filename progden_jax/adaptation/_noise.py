@@ -13,22 +13,22 @@ from progden_jax.divergence import _random
 from progden_jax.divergence._base import Evaluation, accumulate
 from progden_jax.frame import Frame
 
-_OUTLIER = 3.0
-"""Standard deviations beyond which a difference counts as so many."""
+_EDGE = 3.0
+"""Standard deviations from which on a difference is one of the picture."""
 
 
 def correlation(frame: Frame) -> Float[Array, ""]:
     """Of the noise of two channels of a pixel: the mean over pairs, pixels counting alike, in [0, 1].
 
-    Taken from differences of neighbours. What they have of the picture counts as noise, which makes the
-    correlation rather too large.
+    Taken from differences of neighbours that noise explains in every channel.
     """
     variance = cast(Array, frame.variance)
     both = variance[:, 1:] + variance[:, :-1]
     noisy = both > 0
     scale = jnp.where(noisy, jnp.sqrt(jnp.where(noisy, both, 1)), 1)
     difference = frame.color[:, 1:] - frame.color[:, :-1]
-    parts = jnp.where(noisy, difference / scale, 0).clip(-_OUTLIER, _OUTLIER)
+    parts = jnp.where(noisy, difference / scale, 0)
+    parts = jnp.where((jnp.abs(parts) < _EDGE).all(-1, keepdims=True), parts, 0)
     squares = (parts**2).sum()
     # (r + g + b)² − r² − g² − b² is twice the sum over the three pairs.
     pairs = (parts.sum(-1) ** 2).sum() - squares
