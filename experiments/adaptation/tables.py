@@ -26,11 +26,12 @@ def main() -> None:
     )
     parser.add_argument("run", type=Path, nargs="+", help="folders that `progden sweep` wrote")
     runs = parser.parse_args().run
-    print(table([row for run in runs for row in evaluation.rows(run)]))
+    # A render that several runs have counts once.
+    print(table(list({row.key: row for run in runs for row in evaluation.rows(run)}.values())))
 
 
 def table(rows: list[Row]) -> str:
-    """Per number of samples and way to adapt a line; the scenes are those that have all of them."""
+    """Per number of samples and way to adapt a line."""
     renders = {(r.scene, r.spp): r.relmse for r in rows if r.settings["image"] == "render"}
     found: dict[tuple[int, str], dict[str, list[Row]]] = defaultdict(lambda: defaultdict(list))
     for row in rows:
