@@ -11,7 +11,7 @@ from conftest import drawn
 
 import progden_jax as pd
 from progden_jax import adaptation
-from progden_jax.adaptation import _blocks, combination
+from progden_jax.adaptation import _blocks, _noise, combination
 
 SMALL = adaptation.PostCorrection(window=3, layers=2, width=4, patch=8, steps=1)
 
@@ -389,13 +389,34 @@ def test_blocks_hold_what_they_should():
     np.testing.assert_array_equal(_blocks.means(values, kinds.shape), kinds)
 
 
-def test_pooled_variances():
-    """Means over what is inside of 3×3 pixels."""
-    frame, _ = frame_of(0, size=(5, 4))
-    variance = np.random.default_rng(0).random((5, 4, 3)).astype(np.float32)
-    found = np.asarray(adaptation.pooled(frame.replace(variance=variance), 3).variance)
-    np.testing.assert_allclose(found[2, 1], variance[1:4, 0:3].mean((0, 1)), rtol=1e-5)
-    np.testing.assert_allclose(found[0, 3], variance[:2, 2:].mean((0, 1)), rtol=1e-5)
+def test_noise_that_channels_share():
+    """Its correlation is found, and the divergence has the terms between channels."""
+    rng = np.random.default_rng(0)
+    noise = np.sqrt(0.6) * rng.normal(size=(64, 64, 1)) + np.sqrt(0.4) * rng.normal(
+        size=(64, 64, 3)
+    )
+    sigma = np.asarray([0.1, 0.2, 0.4])
+    frame = pd.Frame(
+        np.float32(1 + sigma * noise), np.float32(np.broadcast_to(sigma**2, noise.shape))
+    )
+    found = jax.jit(_noise.correlation)(frame)
+    assert abs(found - 0.6) < 0.02
+    mixing = np.float32(rng.normal(size=(3, 3)))
+    shared = jnp.float32(0.6)
+
+    @jax.jit
+    def evaluate(x, variance, key):
+        def f(x):
+            return x @ mixing.T
+
+        return _noise.evaluate(f, x, variance, shared, key, probes=4)
+
+    value, divergence, *_ = evaluate(frame.color, frame.variance, jax.random.key(0))
+    np.testing.assert_allclose(value, np.asarray(frame.color) @ mixing.T, rtol=1e-5, atol=1e-5)
+    covariance = np.outer(sigma, sigma) * np.where(np.eye(3) == 1, 1, 0.6)
+    divergence = np.asarray(divergence, np.float64)
+    error = divergence.std((0, 1)) / 64
+    assert (abs(divergence.mean((0, 1)) - (covariance * mixing).sum(1)) < 4 * error).all()
 
 
 @pytest.mark.parametrize(
@@ -414,7 +435,6 @@ def test_pooled_variances():
         (lambda f: adaptation.Adaptation(rate=-1), "rate is -1"),
         (lambda f: adaptation.Adaptation(confidence=-1), "confidence is -1"),
         (lambda f: adaptation.Adaptation(steps=0), "steps is 0"),
-        (lambda f: adaptation.Adaptation(pool=4), "pool is 4"),
     ],
 )
 def test_bad_input_is_refused(call, message):

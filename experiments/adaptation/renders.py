@@ -8,11 +8,12 @@ pixels: then all that Stein's estimate assumes holds, and the reference is the t
 
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 
 import progden_jax as pd
 from experiments import _common
-from progden_jax.adaptation import pooled
+from progden_jax._windows import box_sum
 from progden_jax.frame import centre
 
 SPP = (32, 128, 512)
@@ -39,11 +40,14 @@ def main() -> None:
 
 def as_normal(frame: pd.Frame, reference: pd.Frame, *, seed: int) -> tuple[pd.Frame, pd.Frame]:
     """The reference with noise of the frame's variance, pooled, and the reference as the truth."""
-    made = pooled(frame, POOL)
-    variance = np.asarray(made.variance)
+    assert frame.variance is not None
+    inside = jnp.ones_like(frame.variance)
+    variance = np.asarray(box_sum(frame.variance, POOL) / box_sum(inside, POOL))
     noise = np.random.default_rng(seed).normal(size=variance.shape) * np.sqrt(variance)
     color = (np.asarray(reference.color) + noise).astype(np.float32)
-    return made.replace(color=color), reference.replace(variance=np.zeros_like(variance))
+    return frame.replace(color=color, variance=variance), reference.replace(
+        variance=np.zeros_like(variance)
+    )
 
 
 if __name__ == "__main__":

@@ -25,12 +25,13 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("run", type=Path, nargs="+", help="folders that `progden sweep` wrote")
-    for run in parser.parse_args().run:
-        print(f"{run.name}\n\n{table(evaluation.rows(run))}\n")
+    runs = parser.parse_args().run
+    # A render that several runs have counts once.
+    print(table(list({row.key: row for run in runs for row in evaluation.rows(run)}.values())))
 
 
 def table(rows: list[Row]) -> str:
-    """Per number of samples and way to adapt a line; the scenes are those that have all of them."""
+    """Per number of samples and way to adapt a line."""
     renders = {(r.scene, r.spp): r.relmse for r in rows if r.settings["image"] == "render"}
     found: dict[tuple[int, str], dict[str, list[Row]]] = defaultdict(lambda: defaultdict(list))
     for row in rows:
@@ -54,8 +55,7 @@ def adaptation(row: Row) -> str:
     told = row.settings
     kind = told.get("adaptation", "none")
     if kind == "sure":
-        pool = told["adaptation.pool"]
-        return "SURE" if pool == 1 else f"SURE, variances over {pool}×{pool}"
+        return "SURE" if told["adaptation.covariance"] else "SURE, channels as if independent"
     if kind == "post-correct":
         names = {(False, False): "A", (False, True): "B", (True, False): "C", (True, True): "D"}
         setting = names[told["correction.refined"], told["correction.bilateral"]]

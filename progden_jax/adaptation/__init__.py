@@ -6,7 +6,6 @@ estimate. What comes out of either can be given to `progden_jax.progressive_deno
 """
 
 from progden_jax.adaptation._halves import Halves, WithHalves, halves, split
-from progden_jax.adaptation._pooling import pooled
 from progden_jax.adaptation.by_halves import Corrected, post_correct
 from progden_jax.adaptation.by_sure import Adaptation, Adapted, adapt, adapt_mixer
 from progden_jax.adaptation.correction import SETTINGS, PostCorrected, PostCorrection
@@ -23,7 +22,6 @@ __all__ = [
     "adapt",
     "adapt_mixer",
     "halves",
-    "pooled",
     "post_correct",
     "split",
 ]

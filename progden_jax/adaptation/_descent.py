@@ -10,10 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from progden_jax.adaptation import _leaves
+from progden_jax.adaptation import _leaves, _noise
 from progden_jax.adaptation._mixed import bind, exposure_of
 from progden_jax.adaptation._running import OPTIMIZER, descended
-from progden_jax.divergence import MonteCarlo
 from progden_jax.frame import Frame
 from progden_jax.sure import sure
 
@@ -23,8 +22,8 @@ Weights = list[Any]
 
 @functools.partial(
     jax.tree_util.register_dataclass,
-    data_fields=("denoiser", "frame", "exposure", "scale"),
-    meta_fields=("chosen", "method"),
+    data_fields=("denoiser", "frame", "exposure", "scale", "shared"),
+    meta_fields=("chosen", "probes"),
 )
 @dataclasses.dataclass(frozen=True)
 class Task:
@@ -36,15 +35,17 @@ class Task:
     frame : without bad pixels.
     exposure : what the denoiser takes from the whole image.
     scale : (H, W, 3) by which SURE is multiplied, 0 where the loss is not taken.
-    method : of the divergence.
+    shared : correlation of the noise of a pixel's channels.
+    probes : of the divergence.
     """
 
     denoiser: Any
     frame: Frame
     exposure: Any
     scale: Float[Array, "h w 3"]
+    shared: Float[Array, ""]
     chosen: _leaves.Numbers
-    method: MonteCarlo
+    probes: int
 
     @property
     def first(self) -> Weights:
@@ -61,24 +62,26 @@ class Task:
         return _leaves.replaced(self.denoiser, self.chosen, weights)
 
 
-def task_of(denoiser: Any, frame: Frame, chosen: _leaves.Numbers, method: MonteCarlo) -> Task:
+def task_of(denoiser: Any, frame: Frame, chosen: _leaves.Numbers, probes: int) -> Task:
     """SURE over y² + 0.01 + σ² is to be lowered, y the denoised image as it is."""
-    return Task(denoiser, frame, *_before(denoiser, frame), chosen, method)
+    exposure, scale, shared = _before(denoiser, frame)
+    return Task(denoiser, frame, exposure, scale, shared, chosen, probes)
 
 
 @jax.jit
-def _before(denoiser: Any, frame: Frame) -> tuple[Any, Array]:
+def _before(denoiser: Any, frame: Frame) -> tuple[Any, Array, Array]:
     exposure = exposure_of(denoiser, frame)
     y = bind(denoiser, frame, exposure)(frame.color)
-    return exposure, 1 / (y**2 + 0.01 + cast(Array, frame.variance))
+    scale = 1 / (y**2 + 0.01 + cast(Array, frame.variance))
+    return exposure, scale, _noise.correlation(frame)
 
 
 @jax.jit
 def risks(task: Task, weights: Weights, key: jax.Array) -> Float[Array, "h w 3"]:
-    """Weighted SURE of every pixel."""
+    """Weighted SURE of every pixel, with the channels' covariance."""
     f = bind(task.with_weights(weights), task.frame, task.exposure)
     x, variance = task.frame.color, cast(Array, task.frame.variance)
-    y, divergence, *_ = task.method.evaluate(f, x, variance, key)
+    y, divergence, *_ = _noise.evaluate(f, x, variance, task.shared, key, probes=task.probes)
     return task.scale * sure(x, y, variance, divergence)
 
 

@@ -12,6 +12,7 @@ import math
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -20,11 +21,9 @@ from progden_jax._program import checked_variance
 from progden_jax.adaptation import _blocks, _leaves
 from progden_jax.adaptation._descent import Weights, descent, risks, task_of
 from progden_jax.adaptation._mixed import Mixed
-from progden_jax.adaptation._pooling import pooled
 from progden_jax.adaptation._running import Progress, generator
 from progden_jax.denoisers import Denoiser
 from progden_jax.denoisers._base import passable
-from progden_jax.divergence import MonteCarlo
 from progden_jax.frame import Frame, repaired
 from progden_jax.mixing import Mixer
 
@@ -39,8 +38,6 @@ class Adaptation:
     rate : its learning rate.
     only : names of layers or attributes to change, such as ("dec_conv1a", "dec_conv0") of a U-Net;
         none stands for all weights.
-    pool : odd edge in pixels of the window that variances are averaged over for the fit; 1: as they are. A
-        pixel whose samples missed a light is too dark and too sure of it at once, and weights learn that.
     crop : edge in pixels of the part that a step looks at, if the image is larger; memory grows with it.
     block : edge in pixels of the blocks that are kept apart.
     every : steps between looks at the blocks that choose.
@@ -48,23 +45,24 @@ class Adaptation:
     confidence : by how many standard errors those blocks must be better off for the weights to
         be changed at all.
     probes : of the divergence, each time.
+    covariance : whether the estimate counts the noise that a pixel's channels share. Else weights learn to
+        take each channel's noise from the others, unseen.
     """
 
     steps: int = 100
     rate: float = 1e-4
     only: tuple[str, ...] = ()
-    pool: int = 1
     crop: int = 256
     block: int = 16
     every: int = 10
     patience: int = 4
     confidence: float = 1.0
     probes: int = 1
+    covariance: bool = True
 
     def __post_init__(self) -> None:
         for name in ("steps", "crop", "block", "every", "patience", "probes"):
             _checks.positive_int(name, getattr(self, name))
-        _checks.odd_int("pool", self.pool)
         if not 0 < self.rate < math.inf:
             raise ValueError(f"rate is {self.rate}, expected a number above 0, such as 1e-4.")
         if not 0 <= self.confidence < math.inf:
@@ -127,7 +125,11 @@ def adapt(
     Each step takes a pass, a tangent pass and the derivative of both, about six passes over the crop. SURE
     is unbiased for normal noise of known variance; where samples are few, variances of bright rare
     paths are too small, and fitting to it keeps some of the noise. Pixels are weighted by 1/(y² + 0.01 + σ²),
-    so that neither bright nor noisy ones decide alone.
+    so that neither bright nor noisy ones decide alone. The noise that a pixel's channels share is counted, see
+    `Adaptation`.
+
+    Stein's estimate of the result is still too low on real renders, and the mix behind it gains little or
+    nothing: see experiments/adaptation. For the mix take `post_correct`.
     """
     adaptation = Adaptation() if adaptation is None else adaptation
     key = jax.random.key(0) if key is None else key
@@ -173,12 +175,14 @@ def _fit(
     progress: Progress,
 ) -> Adapted:
     checked_variance(frame)
-    frame = pooled(repaired(frame), adaptation.pool)
+    frame = repaired(frame)
     step_key, look_key, host_key = jax.random.split(key, 3)
     host = generator(host_key)
     kinds = _blocks.kinds(frame.size, adaptation.block, host)
     fitting, choosing, telling = (kinds == kind for kind in _blocks.KINDS)
-    task = task_of(denoiser, frame, chosen, MonteCarlo(adaptation.probes))
+    task = task_of(denoiser, frame, chosen, adaptation.probes)
+    if not adaptation.covariance:
+        task = dataclasses.replace(task, shared=jnp.zeros_like(task.shared))
 
     def look(step: int, weights: Weights) -> _Seen:
         probed = np.asarray(risks(task, weights, look_key), np.float64)

@@ -175,12 +175,12 @@ def adapted(
     from progden_jax.frame import repaired
 
     start = time.perf_counter()
-    steps = {} if options.adapt_steps is None else {"steps": options.adapt_steps}
+    steps = options.adapt_steps
     if options.adapt:
         found = adaptation.adapt(
             frame,
             denoiser,
-            adaptation=adaptation.Adaptation(**steps),
+            adaptation=None if steps is None else adaptation.Adaptation(steps=steps),
             key=key,
             progress=lambda done, total: progress(done, total, of="the adaptation"),
         )
@@ -203,7 +203,7 @@ def adapted(
         corrected = adaptation.post_correct(
             both,
             denoiser,
-            correction=adaptation.PostCorrection(**steps),
+            correction=adaptation.PostCorrection(steps=steps),
             start=handed.params,
             key=fit_key,
             progress=lambda done, total: progress(done, total, of="the post-correction"),

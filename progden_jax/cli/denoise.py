@@ -160,7 +160,7 @@ def _run_all(
             return
         pool = ThreadPoolExecutor(at_once)
         try:
-            futures = [pool.submit(attempt, *pair, lambda *_: None) for pair in pairs]
+            futures = [pool.submit(attempt, *pair, _untold) for pair in pairs]
             for (item, outcome), future in zip(pairs, futures, strict=True):
                 bars.advance(item.input.name)
                 future.result()
@@ -193,6 +193,10 @@ def _run_all(
     if failed and len(items) > 1:
         complain(f"{failed} of {len(items)} files failed")
     return FAILED if failed else OK
+
+
+def _untold(done: int, total: int, of: str = "") -> None:
+    """Progress where several files are in work."""
 
 
 def _about(path: str, message: str) -> str:

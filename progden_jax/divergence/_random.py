@@ -52,9 +52,15 @@ def normal(
     key: jax.Array, probe: Array | int, like: Float[Array, "h w c"], origin: Origin = (0, 0)
 ) -> Float[Array, "h w c"]:
     """Standard normal values for the probe of this number, at most 5.3 in magnitude."""
-    # The middles of 2^23 equal parts of (-1, 1).
-    uniform = ((_bits(key, probe, like, origin) >> 9).astype(like.dtype) + 0.5) * 2.0**-22 - 1
-    return 2**0.5 * lax.erf_inv(uniform)
+    return 2**0.5 * lax.erf_inv(2 * uniform(key, probe, like, origin) - 1)
+
+
+@jax.jit
+def uniform(
+    key: jax.Array, probe: Array | int, like: Float[Array, "h w c"], origin: Origin = (0, 0)
+) -> Float[Array, "h w c"]:
+    """Uniform values for the probe of this number: the middles of 2^23 equal parts of (0, 1)."""
+    return ((_bits(key, probe, like, origin) >> 9).astype(like.dtype) + 0.5) * 2.0**-23
 
 
 @jax.jit
