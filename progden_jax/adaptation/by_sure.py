@@ -125,8 +125,7 @@ def adapt(
     Each step takes a pass, a tangent pass and the derivative of both, about six passes over the crop. SURE
     is unbiased for normal noise of known variance; where samples are few, variances of bright rare
     paths are too small, and fitting to it keeps some of the noise. Pixels are weighted by 1/(y² + 0.01 + σ²),
-    so that neither bright nor noisy ones decide alone. The noise that a pixel's channels share is counted, see
-    `Adaptation`.
+    so that neither bright nor noisy ones decide alone.
 
     Stein's estimate of the result is still too low on real renders, and the mix behind it gains little or
     nothing: see experiments/adaptation. For the mix take `post_correct`.
