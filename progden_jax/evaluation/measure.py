@@ -1,33 +1,26 @@
 """One render by some methods: their images, how far they are from the reference, and the rows that say so."""
 
-import dataclasses
 import functools
-from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 import progden_jax as pd
 from progden_jax import metrics
-from progden_jax.denoisers import Denoiser, Network
 from progden_jax.evaluation import parts
-from progden_jax.evaluation.cost import Cost, metered
 from progden_jax.evaluation.database import IMAGES, Row
+from progden_jax.evaluation.images import Estimate, Image, Shown, estimate, mean_of, show
 from progden_jax.evaluation.plan import Cell
-from progden_jax.evaluation.risk import risk_of_held, risk_of_mix
 from progden_jax.evaluation.settings import Settings
 from progden_jax.exr import write_exr
 from progden_jax.frame import centre
 from progden_jax.survey import frame_of, survey
 from progden_jax.training.config import Meaning
-from progden_jax.training.evaluation import oracle_alpha
 from progden_jax.training.index import Item
-
-Image = Float[np.ndarray, "h w 3"]
 
 
 class Job(NamedTuple):
@@ -87,31 +80,6 @@ class _Pair(NamedTuple):
     noise: float
 
 
-class _Estimate(NamedTuple):
-    """The denoised image and what is known of it; only the image without an estimator.
-
-    `denoiser` is as it was before an adaptation, for its mixer is found by it; `fitted` is what came of that.
-    `frame` has the buffers that the denoiser takes and no more, which would make other programs of the same.
-    """
-
-    frame: pd.Frame
-    denoiser: Denoiser
-    fitted: Denoiser
-    denoised: Image
-    divergence: Image | None
-    sure: Image | None
-    cost: Cost
-
-
-class _Shown(NamedTuple):
-    """A method's image, the estimate of its mean squared error, α where it mixes, and what it took."""
-
-    image: Any
-    risk: float | None = None
-    alpha: Any = None
-    cost: Cost = Cost()
-
-
 def measure(job: Job) -> list[Row]:
     """The rows of a job, in its order; images are written first.
 
@@ -121,8 +89,8 @@ def measure(job: Job) -> list[Row]:
         If a file cannot be read, sizes differ, or the render lacks what a method takes.
     """
     pair = _read(job.item, job.variance_of, job.crop)
-    estimate = None if job.shown is None else _estimate(pair.frame, job.shown, job.max_memory)
-    return [_row(cell, pair, estimate, job) for cell in job.cells]
+    made = None if job.shown is None else estimate(pair.frame, job.shown, job.max_memory)
+    return [_row(cell, pair, made, job) for cell in job.cells]
 
 
 def _read(item: Item, variance_of: Meaning, crop: int) -> _Pair:
@@ -138,7 +106,7 @@ def _read(item: Item, variance_of: Meaning, crop: int) -> _Pair:
         frame, truth = ((centre(f, crop) if crop else f) for f in (_sound(frame), reference))
     except ValueError as error:
         raise ValueError(f"{item.path}: {error}") from None
-    noise = 0.0 if truth.variance is None else _mean(truth.variance)
+    noise = 0.0 if truth.variance is None else mean_of(truth.variance)
     return _Pair(frame, np.asarray(truth.color), noise)
 
 
@@ -152,119 +120,21 @@ def _sound(frame: pd.Frame) -> pd.Frame:
     return frame_of({name: found.repaired(name) for name in found.buffers})
 
 
-def _estimate(frame: pd.Frame, settings: Settings, max_memory: int | None) -> _Estimate:
-    denoiser = parts.denoiser_for(frame, settings)
-    if isinstance(denoiser, Network) and settings.adaptation != "post-correct":
-        taken = {n: getattr(frame, n) for n in ("color", "variance", *denoiser.inputs)}
-        frame = frame_of({name: buffer for name, buffer in taken.items() if buffer is not None})
-    fitted, fitting = denoiser, Cost(0.0)
-    if settings.fit() is not None:
-        fitted, fitting = metered(lambda: parts.adapted(frame, denoiser, settings))
-    made = functools.partial(_Estimate, frame, denoiser, fitted)
-    method = settings.method()
-    if method is None:
-        plain, cost = metered(lambda: pd.denoise(frame, fitted, max_memory=max_memory))
-        return made(np.asarray(plain.image), None, None, fitting.then(cost))
-    found, cost = metered(
-        lambda: pd.progressive_denoise(
-            frame,
-            fitted,
-            mixer=_Nothing(),
-            bound=False,
-            method=method,
-            key=jax.random.key(settings.seed),
-            outputs=("denoised", "sure", "divergence"),
-            max_memory=max_memory,
-        )
-    )
-    images = map(np.asarray, (found.denoised, found.divergence, found.sure))
-    return made(*images, fitting.then(cost))
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class _Known:
-    """A denoiser whose output is there already."""
-
-    image: Any
-
-    def __call__(self, frame: pd.Frame) -> Array:
-        return self.image
-
-    def bind(self, frame: pd.Frame) -> Callable[[Array], Array]:
-        return lambda x: self.image
-
-
-@jax.tree_util.register_static
-@dataclasses.dataclass(frozen=True)
-class _Nothing:
-    """A mixer for where no mix is asked for: it costs least."""
-
-    receptive_radius: int = 0
-
-    def __call__(self, x: Array, *_: Any, **__: Any) -> Array:
-        return jax.numpy.zeros_like(x)
-
-
-def _show(settings: Settings, frame: pd.Frame, estimate: _Estimate | None) -> _Shown:
-    if estimate is None or settings.image == "render":
-        return _Shown(frame.color, None if frame.variance is None else _mean(frame.variance))
-    if settings.image == "denoised":
-        risk = None if estimate.sure is None else _mean(estimate.sure)
-        return _Shown(estimate.denoised, risk, cost=estimate.cost)
-    mixer = parts.mixer_for(estimate.denoiser, settings)
-    found, cost = metered(
-        lambda: pd.progressive_denoise(
-            pd.Frame(frame.color, frame.variance),
-            _Known(estimate.denoised),
-            mixer=mixer,
-            bound=settings.limits if settings.bound else False,
-            divergence=cast(Any, estimate.divergence),
-            outputs=("image", "alpha"),
-            skip=False,
-        )
-    )
-    if settings.risk_probes:
-        risk = risk_of_mix(
-            estimate.frame,
-            estimate.fitted,
-            mixer,
-            settings.limits if settings.bound else None,
-            method=cast(pd.Method, settings.method()),
-            probes=settings.risk_probes,
-            seed=settings.seed,
-        )
-    else:
-        known: Any = (frame.color, estimate.denoised, frame.variance, estimate.divergence)
-        risk = float(risk_of_held(found.alpha, *known))
-    return _Shown(found.image, risk, found.alpha, estimate.cost.then(cost))
-
-
-@jax.jit
-def _oracle(x: Array, y: Array, reference: Array) -> tuple[Array, Array]:
-    alpha = oracle_alpha(x, y, reference)
-    return x + alpha * (y - x), alpha
-
-
 @jax.jit
 def _scores(image: Array, reference: Array) -> dict[str, Array]:
     names = ("rmse", "smape", "relmse", "ssim")
     return {name: getattr(metrics, name)(image, reference) for name in names}
 
 
-def _row(cell: Cell, pair: _Pair, estimate: _Estimate | None, job: Job) -> Row:
+def _row(cell: Cell, pair: _Pair, made: Estimate | None, job: Job) -> Row:
     settings, frame = cell.method.settings, pair.frame
-    if settings.image == "oracle" and estimate is not None:
-        best, alpha = _oracle(frame.color, estimate.denoised, pair.reference)
-        shown = _Shown(best, None, alpha)
-    else:
-        shown = _show(settings, frame, estimate)
+    shown = show(settings, frame, made, pair.reference)
     image = np.asarray(shown.image)
     if not np.isfinite(image).all():
         raise ValueError(f"{cell.item.path}: the result of {cell.method.label!r} is not finite.")
     scores = {name: float(v) for name, v in _scores(image, pair.reference).items()}
     scores["flip"] = metrics.flip(cast(Any, image), cast(Any, pair.reference))
-    of = estimate if settings.image != "render" else None
+    of = made if settings.image != "render" else None
     kept = None
     if job.run is not None:
         kept = f"{IMAGES}/{cell.key}.exr"
@@ -277,7 +147,7 @@ def _row(cell: Cell, pair: _Pair, estimate: _Estimate | None, job: Job) -> Row:
         settings={**settings.flat(), **parts.trained_as(settings)},
         **scores,
         mse=_squared_error(image, pair),
-        sure=None if of is None or of.sure is None else _mean(of.sure),
+        sure=None if of is None or of.sure is None else mean_of(of.sure),
         denoised_mse=None if of is None else _squared_error(of.denoised, pair),
         seconds=shown.cost.seconds,
         render=str(cell.item.path),
@@ -286,16 +156,16 @@ def _row(cell: Cell, pair: _Pair, estimate: _Estimate | None, job: Job) -> Row:
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         risk=shown.risk,
         sure_error=None if of is None or of.sure is None else _standard_error(of.sure),
-        alpha=None if shown.alpha is None else _mean(shown.alpha),
+        alpha=None if shown.alpha is None else mean_of(shown.alpha),
         memory=shown.cost.memory,
         crop=job.crop or None,
     )
 
 
-def _keep(path: Path, image: Image, shown: _Shown, estimate: _Estimate | None) -> None:
+def _keep(path: Path, image: Image, shown: Shown, made: Estimate | None) -> None:
     layers = {"alpha": shown.alpha}
-    if estimate is not None:
-        layers |= {"sure": estimate.sure, "denoised": estimate.denoised}
+    if made is not None:
+        layers |= {"sure": made.sure, "denoised": made.denoised}
     path.parent.mkdir(exist_ok=True)
     present = {name: layer for name, layer in layers.items() if layer is not None}
     write_exr(path, image, layers=present, overwrite=True)
@@ -304,10 +174,6 @@ def _keep(path: Path, image: Image, shown: _Shown, estimate: _Estimate | None) -
 def _squared_error(image: Image, pair: _Pair) -> float:
     difference = np.asarray(image, np.float64) - pair.reference
     return float(np.mean(difference**2)) - pair.noise
-
-
-def _mean(values: Any) -> float:
-    return float(np.asarray(values).mean(dtype=np.float64))
 
 
 def _standard_error(values: Image) -> float:
