@@ -84,7 +84,7 @@ def of_buffers(combiner: DeepCombiner, frames: Sequence[Frame]) -> tuple[Frame, 
     """The render that sub-averages of its samples make up, and a denoiser for it that combines them.
 
     The sub-averages are filtered by the kernels that the denoiser finds for their mean, where what it binds
-    has ``filtered(x, images)``, as that of `NFOR` has; else each is denoised by itself.
+    has ``filtered(x, images)``, as that of `progden_jax.denoisers.NFOR` has; else each is denoised by itself.
 
     Parameters
     ----------
