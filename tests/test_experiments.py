@@ -26,6 +26,7 @@ from experiments.mc_vs_exact import plot as mc_vs_exact
 from experiments.mc_vs_exact import train as mc_vs_exact_train
 from experiments.performance import run as performance
 from experiments.performance import step
+from experiments.related_work import plot as related_work
 from experiments.stability import run as stability
 from experiments.table1 import plot as table1
 from experiments.table2 import plot as table2
@@ -108,7 +109,7 @@ def results(config: Path, renders: Path, run: Path) -> Path:
     Errors fall as 1/√spp; the render's is 2, the denoiser's 1, the oracle's 0.5, the first mix's 0.6 and 0.01
     more for each further one. SURE is 1.5 of its truth, the risk 1.1.
     """
-    plan = evaluation.load(config, data={"data": [str(renders)]})
+    plan = evaluation.load(config, data={"data": [str(renders)], "scenes": []})
     usual = {"render": 2.0, "denoised": 1.0, "oracle": 0.5}
     mixes = [label for label, settings in plan.methods if settings.image == "mix"]
     rows = []
@@ -243,6 +244,21 @@ def test_main_job(command, noisy, tmp_path):
     assert quiet[4:] == wild[4:] == ["1.5", "0.25", "yes"]
     # Of 768 values in [0, 1] three are 100 instead, or 200, and one is 0.1 %.
     assert 0.1 < float(quiet[2]) < float(wild[2]) < 0.3
+
+
+@pytest.mark.parametrize("name", ["sweep", "fitted"])
+def test_related_work(command, noisy, tmp_path, name):
+    """The first mix is 0.6 of what is mixed, everywhere."""
+    run = results(EXPERIMENTS / "related_work" / f"{name}.yaml", noisy, tmp_path)
+    printed = command(related_work, run, "--output", tmp_path)
+    (relmse, rmse, *_) = cells(printed, "unet-hdr")
+    assert relmse[1:] == rmse[1:] == ["0.3536", "0.1768", "0.08839", "0.04419", ""]
+    assert all(row[5].startswith("0.6") for row in cells(printed, "unet-hdr, combined, mixed")[:4])
+    assert bool(cells(printed, "unet-hdr, post-corrected, mixed")) == (name == "fitted")
+    stem = {"sweep": "related_work"}.get(name, name)
+    assert (tmp_path / f"{stem}.png").stat().st_size > 10_000
+    methods = {row["method"] for row in _common.read_csv(tmp_path / f"{stem}.csv")}
+    assert {"render", "nfor", "nfor, combined, mixed"} <= methods
 
 
 def test_fig2(command, noisy, tmp_path):

@@ -2,6 +2,8 @@
 
 progden sweep experiments/related_work/sweep.yaml -o runs/related_work
 python -m experiments.related_work.plot runs/related_work
+progden sweep experiments/related_work/fitted.yaml -o runs/related_work-fitted
+python -m experiments.related_work.plot runs/related_work-fitted
 """
 
 from collections.abc import Mapping, Sequence
@@ -100,11 +102,13 @@ def convergence(rows: Sequence[Row], path: Path) -> None:
 
 def draw(rows: Sequence[Row], output: Path) -> str:
     """Tables, and a figure of convergence."""
-    convergence(rows, output / "related_work.png")
+    fitted = any("adaptation" in row.settings for row in rows)
+    stem = "fitted" if fitted else "related_work"
+    convergence(rows, output / f"{stem}.png")
     named = _plots.renamed(rows, name)
     columns = (*METRICS, "seconds", "memory")
     _common.write_csv(
-        output / "related_work.csv",
+        output / f"{stem}.csv",
         ("scene", "spp", "method", *columns),
         ((r.scene, r.spp, r.method, *(getattr(r, c) for c in columns)) for r in named),
     )
