@@ -813,6 +813,7 @@ CONTRADICTIONS = [
     "--adapt --adapt-steps 0",
     "--adapt-steps 5",
     "--halves a.exr b.exr",
+    "--denoiser nfor --combiner nfor --halves a.exr b.exr",
     "--post-correct --halves a.exr",
     "--post-correct --halves a.exr b.exr --variance-from a.exr b.exr",
 ]

@@ -21,6 +21,7 @@ RECORDED: dict[str, list[float]] = {
     "mixer-oidn-hdr": [0.895476, 0.832945, 0.884234, 0.987992, 0.712064, 0.913414],
     "mixer-oidn-hdr-alb-nrm": [0.881646, 0.821827, 0.8716, 0.879978, 0.134119, 0.49366],
     "mixer-unet-hdr": [0.739653, 0.603126, 0.712924, 0.731417, 0.222536, 0.483584],
+    "residual-hdr-alb-nrm-dep": [0.0627269, 0.0316737, 0.0523986, 0.110373, 0.0451014, 0.092738],
     "unet-hdr": [0.0606872, 0.0305358, 0.0520162, 0.10864, 0.0451267, 0.0947322],
 }
 """Means of red, green and blue, then one pixel: of a denoised crop, also a blurred one with a combiner behind

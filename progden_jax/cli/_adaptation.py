@@ -104,6 +104,10 @@ class AdaptOptions:
                 "--halves are for --post-correct and --denoiser nfor; for the variance alone give "
                 "--variance-from."
             )
+        if network.combiner and not self.post_correct:
+            raise UsageError(
+                "--halves go to --denoiser nfor itself, and --combiner puts another behind it: leave one out."
+            )
         if read.variance_from:
             raise UsageError(
                 "--halves and --variance-from both name other renders, and both give a variance: give one."
