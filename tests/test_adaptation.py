@@ -197,7 +197,25 @@ def test_limits_of_the_kernel(guides):
     found = combined(flat, tiny, np.float32(center), np.float32(controls((6, 7))[0]), 5)
     np.testing.assert_allclose(found, 1, rtol=1e-6)
     apart = combined(np.float32(guides) * 1e3, tiny, np.float32(center), None, 5)
-    np.testing.assert_allclose(apart, np.float32(guides[..., :3]) * 1e3, rtol=1e-5)
+    np.testing.assert_allclose(apart, np.float32(guides[..., :3]) * 1e3, rtol=1e-5, atol=1e-3)
+
+
+def test_weights_that_vanish_have_derivatives(guides):
+    """Fireflies far from all else, and a network that gives their centres next to nothing."""
+    _, bandwidths, center = controls(guides.shape[:2])
+    far = 1e3 * np.float32(guides)
+    lost = np.full_like(np.float32(center), 1e-38)
+
+    @jax.jit
+    def slopes(bandwidths, center):
+        return jax.grad(lambda *a: (combined(far, *a, None, 5) ** 2).sum(), (0, 1))(
+            bandwidths, center
+        )
+
+    for found in slopes(1e-2 * np.float32(bandwidths), lost):
+        assert np.isfinite(found).all()
+    alone = combined(far, 1e-2 * np.float32(bandwidths), lost, None, 5)
+    np.testing.assert_allclose(alone, far[..., :3], rtol=1e-5, atol=1e-3)
 
 
 def test_one_pixel_is_its_own_mean():

@@ -25,6 +25,9 @@ _RADIANCE = slice(0, 2)
 
 _EPSILON = 1e-4
 
+_LEAST = 1e-6
+"""Weight that every pixel has for itself besides: where all others vanish, derivatives must not overflow."""
+
 Weigh = Callable[[Array, Float[Array, "5 h w"]], Float[Array, "h w"]]
 """From an offset's number in raster order and the squared distances of the guides there to its weight."""
 
@@ -92,8 +95,8 @@ def combine(
         return weigh(index, jnp.stack(list(_by_guide(distances))))[None]
 
     total = weighted_sums(planes, weights_of, window=window, summed=CHANNELS)
-    weights = jnp.maximum(total[-1], jnp.finfo(guides.dtype).tiny)
-    means = (total[:-1] / weights).transpose(1, 2, 0)
+    total = total + _LEAST * planes[:CHANNELS]
+    means = (total[:-1] / total[-1]).transpose(1, 2, 0)
     differences = guides[..., 3:12] - means[..., 3:]
     if scales is None:
         return means[..., :3] + differences[..., :3]
