@@ -729,9 +729,15 @@ def test_interrupt_leaves_whole_files_only(tmp_path, frames, progden, monkeypatc
     inputs = [tmp_path / f"{name}.exr" for name in "abc"]
     status, stdout, stderr = progden("denoise", *inputs, "-o", tmp_path / "out", "--json")
     assert status == 130
-    # What another thread had begun is finished.
+    # What another thread had begun is finished; which of the threads comes second is chance.
     left = sorted(os.listdir(tmp_path / "out"))
-    assert left in (["a.exr"], ["a.exr", "b.exr"], ["a.exr", "c.exr"])
+    assert left in [
+        ["a.exr"],
+        ["b.exr"],
+        ["a.exr", "b.exr"],
+        ["a.exr", "c.exr"],
+        ["b.exr", "c.exr"],
+    ]
     assert f"{len(left)} of 3 files were done; the same command with --resume goes on" in stderr
     assert [Path(f["output"]).name for f in report(stdout) if f["ok"]] == left
     for name in left:

@@ -46,8 +46,8 @@ progden.state = (() => {
     exposure: numeric(0, -30, 30, 2),
     // The magnification (null fits), in device pixels; the image point at the middle of a panel.
     zoom: numeric(null, 1 / 64, 256, 4),
-    x: numeric(0, -1e6, 1e6, 2),
-    y: numeric(0, -1e6, 1e6, 2),
+    x: numeric(0, -1e6, 1e6, 4),
+    y: numeric(0, -1e6, 1e6, 4),
     hide: {
       initial: "",
       parse: (text) => (/^(\d+(\.\d+)*)?$/.test(text) ? text : undefined),
@@ -84,7 +84,12 @@ progden.state = (() => {
   }
 
   function set(changes) {
-    Object.assign(values, changes);
+    for (const [name, value] of Object.entries(changes)) {
+      const { initial, parse, print } = fields[name];
+      // As a reload will read it, so that one shows the same to the pixel.
+      const kept = value === initial ? value : parse(print(value));
+      values[name] = kept === undefined ? value : kept;
+    }
     // Browsers refuse more than about a hundred of these in half a minute.
     clearTimeout(timer);
     timer = setTimeout(write, 200);
