@@ -94,7 +94,7 @@ def convergence(rows: Sequence[Row], path: Path) -> None:
             _plots.spp_ticks(axis, (row.spp for row in own))
             axis.grid(alpha=0.3)
         column[0].set_title(denoiser)
-        column[0].legend(fontsize=7)
+        column[1].legend(fontsize=6, loc="lower left")
     for axis, metric in zip(axes[:, 0], ("relmse", "rmse"), strict=True):
         axis.set_ylabel(METRICS[metric])
     _common.save_figure(path, figure)
