@@ -94,9 +94,11 @@ def convergence(rows: Sequence[Row], path: Path) -> None:
             _plots.spp_ticks(axis, (row.spp for row in own))
             axis.grid(alpha=0.3)
         column[0].set_title(denoiser)
-        column[1].legend(fontsize=6, loc="lower left")
     for axis, metric in zip(axes[:, 0], ("relmse", "rmse"), strict=True):
         axis.set_ylabel(METRICS[metric])
+    curves = [axis.get_legend_handles_labels() for axis in axes[0]]
+    labelled = {label: h for group in curves for h, label in zip(*group, strict=True)}
+    figure.legend(list(labelled.values()), list(labelled), loc="outside lower center", ncols=3)
     _common.save_figure(path, figure)
 
 
