@@ -131,6 +131,15 @@ class Repairs(NamedTuple):
     nonfinite_auxiliary: Int[Array, ""]
 
 
+def share(frame: Frame, count: int) -> Frame:
+    """The frame with the variance and the samples of one of so many equal parts of its samples."""
+    variance, spp = frame.variance, frame.spp
+    return frame.replace(
+        variance=None if variance is None else count * variance,
+        spp=None if spp is None else spp / count,
+    )
+
+
 def centre(frame: Frame, size: int) -> Frame:
     """The middle size × size pixels of every buffer.
 

@@ -10,7 +10,7 @@ from progden_jax import _checks
 from progden_jax._numeric import safe_sqrt
 from progden_jax.denoisers._base import Bound
 from progden_jax.divergence import _random
-from progden_jax.frame import Frame, repaired
+from progden_jax.frame import Frame, repaired, share
 
 _DIFFERING = ("color", "albedo", "normal", "depth")
 
@@ -92,9 +92,27 @@ def split(frame: Frame, key: jax.Array) -> Halves:
     return Halves(frame, {"color": noise})
 
 
+class Around:
+    """What denoisers around another, tied to one frame, have in common; `bind` is their own."""
+
+    denoiser: Any
+
+    @property
+    def name(self) -> str | None:
+        """The denoiser's, by which its mixer is found."""
+        return getattr(self.denoiser, "name", None)
+
+    def __call__(self, frame: Frame) -> Float[Array, "h w 3"]:
+        """The image that it makes, (H, W, 3) linear radiance."""
+        return self.bind(frame)(frame.color)
+
+    def bind(self, frame: Frame) -> Bound:
+        raise NotImplementedError
+
+
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class WithHalves:
+class WithHalves(Around):
     """A denoiser that makes use of two independent halves, such as `progden_jax.denoisers.NFOR`.
 
     Parameters
@@ -105,15 +123,6 @@ class WithHalves:
 
     denoiser: Any
     difference: Float[Array, "h w 3"]
-
-    @property
-    def name(self) -> str | None:
-        """The denoiser's, by which its mixer is found."""
-        return getattr(self.denoiser, "name", None)
-
-    def __call__(self, frame: Frame) -> Float[Array, "h w 3"]:
-        """The denoised image, (H, W, 3) linear radiance."""
-        return self.bind(frame)(frame.color)
 
     def bind(self, frame: Frame) -> Bound:
         """f with y = f(x) for the frame that the halves make up."""
@@ -130,13 +139,10 @@ def separate(frame: Frame, difference: dict[str, Array]) -> tuple[Frame, Frame]:
                 f"the halves differ in {name} by an array of shape {part.shape}, and this frame has "
                 f"{'none' if found is None else found.shape}: halves belong to the frame that they make up."
             )
-    shared = {
-        "variance": None if frame.variance is None else 2 * frame.variance,
-        "spp": None if frame.spp is None else frame.spp / 2,
-    }
+    part = share(frame, 2)
 
     def half(sign: int) -> Frame:
         changed = {name: getattr(frame, name) + sign * d for name, d in difference.items()}
-        return frame.replace(**shared, **changed)
+        return part.replace(**changed)
 
     return half(1), half(-1)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from progden_jax import _checks
 from progden_jax._convolution import same_convolution
 from progden_jax.adaptation import combination
-from progden_jax.adaptation._halves import separate
+from progden_jax.adaptation._halves import Around, separate
 from progden_jax.denoisers import Denoiser
 from progden_jax.denoisers._base import Bound
 from progden_jax.frame import Frame
@@ -128,7 +128,7 @@ SETTINGS = {
     meta_fields=("correction",),
 )
 @dataclasses.dataclass(frozen=True)
-class PostCorrected:
+class PostCorrected(Around):
     """A denoiser followed by the correction that was fitted to one frame; `post_correct` makes it.
 
     y = f(x) = ½ (g(x + d) + g(x − d)), where g is denoiser and correction of one half, and d, half of the
@@ -148,15 +148,6 @@ class PostCorrected:
     params: Params
     difference: dict[str, Array]
     correction: PostCorrection
-
-    @property
-    def name(self) -> str | None:
-        """The denoiser's, by which its mixer is found."""
-        return getattr(self.denoiser, "name", None)
-
-    def __call__(self, frame: Frame) -> Float[Array, "h w 3"]:
-        """The corrected image, (H, W, 3) linear radiance."""
-        return self.bind(frame)(frame.color)
 
     def bind(self, frame: Frame) -> Bound:
         """f with y = f(x); `frame` must be of the size of the one that it was fitted to."""

@@ -1,6 +1,7 @@
 """`progden train`: weights from renders."""
 
 import contextlib
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -76,10 +77,7 @@ def mixer(
     from progden_jax.training import MixerConfig, MixerTask
 
     chosen = _load(MixerConfig, config, data, set)
-
-    def task(progress: Callable[[int, int], None]) -> "Task":
-        return MixerTask(chosen, cache_folder=cache, progress=progress)
-
+    task = functools.partial(MixerTask, chosen, cache_folder=cache)
     return _train(task, output, until=until, json=json)
 
 
@@ -98,10 +96,7 @@ def denoiser(
     from progden_jax.training import DenoiserConfig, DenoiserTask
 
     chosen = _load(DenoiserConfig, config, data, set)
-
-    def task(progress: Callable[[int, int], None]) -> "Task":
-        return DenoiserTask(chosen, progress=progress)
-
+    task = functools.partial(DenoiserTask, chosen)
     return _train(task, output, until=until, json=json)
 
 
@@ -123,10 +118,7 @@ def combiner(
     from progden_jax.training import CombinerConfig, CombinerTask
 
     chosen = _load(CombinerConfig, config, data, set)
-
-    def task(progress: Callable[[int, int], None]) -> "Task":
-        return CombinerTask(chosen, cache_folder=cache, progress=progress)
-
+    task = functools.partial(CombinerTask, chosen, cache_folder=cache)
     return _train(task, output, until=until, json=json)
 
 
@@ -153,7 +145,7 @@ def _load(
 
 
 def _train(
-    make: "Callable[[Callable[[int, int], None]], Task]",
+    make: "Callable[..., Task]",
     output: Path,
     *,
     until: int | None,
@@ -166,7 +158,7 @@ def _train(
         raise UsageError(f"--until is {until}, expected a step from 1 up.")
     enable_compilation_cache()
     with counting("renders, denoised") as progress:
-        task = make(progress)
+        task = make(progress=progress)
     with contextlib.closing(_Report(quiet=json)) as report:
         outcome = train(task, output, report=report, until=until)
     step, best = int(outcome.state.step), int(outcome.state.best_step)

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from progden_jax import _checks
-from progden_jax.combiner.denoiser import BoundCombiner, DeepCombiner, applied, bound, call, taken
-from progden_jax.denoisers._base import Bound
-from progden_jax.frame import Frame, repaired
+from progden_jax.combiner.denoiser import BoundCombiner, DeepCombiner, applied, bound, taken
+from progden_jax.denoisers._base import Bound, call
+from progden_jax.frame import Frame, repaired, share
 
 
 @functools.partial(
@@ -51,7 +51,7 @@ class BufferedCombiner:
         if hasattr(whole, "filtered"):
             inner = [whole]
         else:
-            part = _share(frame, count)
+            part = share(frame, count)
             inner = [
                 bound(denoiser, part.replace(color=frame.color + d), None, None)
                 for d in self.differences
@@ -69,15 +69,6 @@ def _run_buffers(f: BoundCombiner, differences: Array, x: Array) -> Array:
     else:
         denoised = jnp.stack([g(part) for g, part in zip(f.inner, noisy, strict=True)])
     return applied(f, noisy, denoised)
-
-
-def _share(frame: Frame, count: int) -> Frame:
-    """The frame with the variance and the samples of one of so many equal parts of it."""
-    variance, spp = frame.variance, frame.spp
-    return frame.replace(
-        variance=None if variance is None else count * variance,
-        spp=None if spp is None else spp / count,
-    )
 
 
 def of_buffers(combiner: DeepCombiner, frames: Sequence[Frame]) -> tuple[Frame, BufferedCombiner]:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from progden_jax import _checks
 from progden_jax.combiner.network import KernelNetwork, Params
 from progden_jax.denoisers import Denoiser
-from progden_jax.denoisers._base import Bound
+from progden_jax.denoisers._base import Bound, call
 from progden_jax.denoisers._network import Valid, inside_of
 from progden_jax.frame import Frame
 
@@ -95,11 +95,6 @@ class DeepCombiner:
     def name(self) -> str:
         """For messages."""
         return f"{getattr(self.denoiser, 'name', type(self.denoiser).__name__)}+combiner"
-
-
-@jax.jit
-def call(denoiser: Any, frame: Frame) -> Array:
-    return denoiser.bind(frame)(frame.color)
 
 
 @functools.partial(

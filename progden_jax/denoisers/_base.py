@@ -33,6 +33,12 @@ class Denoiser(Protocol):
         ...
 
 
+@jax.jit
+def call(denoiser: Any, frame: Frame) -> Array:
+    """The denoised image, as one program; the denoiser is a pytree."""
+    return denoiser.bind(frame)(frame.color)
+
+
 class Bounded:
     """A bound denoiser that reaches as far as its ``denoiser`` says."""
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from progden_jax import _checks
 from progden_jax.denoisers import graph
-from progden_jax.denoisers._base import Bound, Bounded
+from progden_jax.denoisers._base import Bound, Bounded, call
 from progden_jax.denoisers.graph import Layered, Node
 from progden_jax.frame import Frame
 
@@ -89,7 +89,7 @@ class Network:
         ValueError
             If the frame is no single image, or lacks a buffer that the network takes.
         """
-        return _jitted_call(self, frame)
+        return call(self, frame)
 
     def bind(self, frame: Frame, *, valid: Valid = None, exposure: Any = None) -> Bound:
         """f with y = f(x) for the frame's other buffers, constants; a pytree, so it passes through jit.
@@ -146,11 +146,6 @@ class Network:
         for name, value in zip(names, values, strict=True):
             setattr(denoiser, name, value)
         return denoiser
-
-
-@jax.jit
-def _jitted_call(denoiser: Network, frame: Frame) -> Array:
-    return denoiser.bind(frame)(frame.color)
 
 
 @jax.tree_util.register_dataclass

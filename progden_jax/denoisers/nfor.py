@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from progden_jax import _checks
 from progden_jax._windows import box_sum
-from progden_jax.denoisers._base import Bound, Bounded
+from progden_jax.denoisers._base import Bound, Bounded, call
 from progden_jax.denoisers._network import PRECISIONS, Valid, inside_of
 from progden_jax.denoisers._patches import BLOCK, Windows
 from progden_jax.denoisers._regression import regress
@@ -98,7 +98,7 @@ class NFOR:
         ValueError
             If the frame is no single image, or has no variance.
         """
-        return _call(self, frame)
+        return call(self, frame)
 
     def bind(
         self,
@@ -168,11 +168,6 @@ def log_depth(depth: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 
 
 _FEATURE = {"albedo": lambda albedo: albedo, "normal": lambda normal: normal, "depth": log_depth}
-
-
-@jax.jit
-def _call(denoiser: NFOR, frame: Frame) -> Array:
-    return denoiser.bind(frame)(frame.color)
 
 
 @jax.tree_util.register_dataclass
