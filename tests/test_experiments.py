@@ -16,6 +16,7 @@ from conftest import DEMO
 
 import progden_jax as pd
 from experiments import _common, _plots, _training
+from experiments.adaptation import renders as normal_renders
 from experiments.divergence import methods
 from experiments.fig2 import plot as fig2
 from experiments.fig10 import plot as fig10
@@ -244,6 +245,24 @@ def test_main_job(command, noisy, tmp_path):
     assert quiet[4:] == wild[4:] == ["1.5", "0.25", "yes"]
     # Of 768 values in [0, 1] three are 100 instead, or 200, and one is 0.1 %.
     assert 0.1 < float(quiet[2]) < float(wild[2]) < 0.3
+
+
+def test_renders_of_normal_noise(command, noisy, tmp_path):
+    """Around the reference, by the variance averaged over 5×5 pixels."""
+    words = ("--data", noisy, "--scenes", "1", "--crop", "16", "--spp", "8")
+    command(normal_renders, tmp_path / "out", *words)
+    given, frame = (
+        pd.read_exr(f / f"{SCENES[0]}_000008spp.exr") for f in (noisy, tmp_path / "out")
+    )
+    truth, reference = (
+        pd.read_exr(f / f"{SCENES[0]}_004096spp.exr") for f in (noisy, tmp_path / "out")
+    )
+    np.testing.assert_array_equal(reference.color, truth.color)
+    assert not np.any(reference.variance)
+    around = np.asarray(given.variance)[4:9, 6:11].mean((0, 1))
+    np.testing.assert_allclose(frame.variance[6, 8], around, rtol=1e-5)
+    spread = (np.asarray(frame.color) - truth.color) / np.sqrt(frame.variance)
+    assert 0.9 < spread.std() < 1.1
 
 
 @pytest.mark.parametrize("name", ["sweep", "fitted"])

@@ -1,9 +1,9 @@
-"""The renders that the sweeps of this folder take: middles of the validation scenes, as they are or normal.
+"""Middles of the validation scenes with normal noise of known variance, as Stein's estimate assumes it.
 
-    python -m experiments.adaptation.renders FOLDER [--crop 64] [--normal]
+    python -m experiments.adaptation.renders FOLDER [--crop 64]
 
-With --normal each is the reference plus normal noise, whose variance is that of the render averaged over 5×5
-pixels: then all that Stein's estimate assumes holds, and the reference is the truth.
+Each is the reference, which so is the truth, plus normal noise whose variance is that of the render averaged
+over 5×5 pixels.
 """
 
 from pathlib import Path
@@ -25,14 +25,12 @@ def main() -> None:
     parser.add_argument("output", type=Path, help="a folder, made if missing")
     parser.add_argument("--spp", type=int, nargs="+", default=SPP)
     parser.add_argument("--crop", type=int, default=64, help="edge in pixels")
-    parser.add_argument("--normal", action="store_true", help="normal noise of known variance")
     arguments = parser.parse_args()
     arguments.output.mkdir(parents=True, exist_ok=True)
     names = _common.scenes(arguments.data, arguments.scenes)
     for name, spp, frame, reference in _common.series(arguments.data, names, arguments.spp):
         frame, reference = (centre(f, arguments.crop) for f in (frame, reference))
-        if arguments.normal:
-            frame, reference = as_normal(frame, reference, seed=spp)
+        frame, reference = as_normal(frame, reference, seed=spp)
         for count, image in ((spp, frame), (_common.REFERENCE_SPP, reference)):
             path = arguments.output / f"{name}_{count:06}spp.exr"
             pd.write_exr(path, image, overwrite=True)
