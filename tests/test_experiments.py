@@ -25,6 +25,7 @@ from experiments.fig14 import plot as fig14
 from experiments.main_job import plot as main_job
 from experiments.mc_vs_exact import plot as mc_vs_exact
 from experiments.mc_vs_exact import train as mc_vs_exact_train
+from experiments.performance import convolutions
 from experiments.performance import run as performance
 from experiments.performance import step
 from experiments.related_work import plot as related_work
@@ -435,6 +436,15 @@ def test_step(command, renders, tmp_path):
     (row,) = cells(printed, "multiscale")
     assert row[1] == f"{found / 1e9:.1f}"
     assert float(row[5]) > 0
+
+
+def test_convolutions(command):
+    """Every way to the convolution gives the same, Winograd's too, in bfloat16 to its digits."""
+    printed = command(convolutions, "--shapes", "8x4x4", "--repeats", 1)
+    off = {row[1]: row[5] for row in cells(printed, "8x4x4")}
+    assert float(off["Winograd"]) < 1e-5
+    assert 1e-4 < float(off["direct, bfloat16"]) < 1e-2
+    assert off["product alone"] == ""
 
 
 def test_performance(command, tiny, tmp_path):

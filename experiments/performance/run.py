@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 import progden_jax as pd
 from experiments import _common
@@ -307,8 +308,8 @@ def _torch_version() -> str:
 
 def figure(rows: Sequence[Row], off: Sequence[Error], probes: int) -> Figure:
     """Time against size, per program, and error against time, per number of probes."""
-    made = Figure(figsize=(12, 3.8), layout="constrained")
-    axes = made.subplots(1, 3)
+    made = Figure(figsize=(12 if off else 8, 3.8), layout="constrained")
+    axes = made.subplots(1, 3 if off else 2)
     panels = (("forward pass", FORWARD, ""), (f"whole, {probes} probes", WHOLE, probes))
     for axis, (title, part, k) in zip(axes, panels, strict=False):
         chosen = [r for r in rows if (r.part, r.probes) == (part, k)]
@@ -322,6 +323,7 @@ def figure(rows: Sequence[Row], off: Sequence[Error], probes: int) -> Figure:
         ]
         axis.loglog(*zip(*line, strict=True), "k--", label=LIMIT)
         axis.set(title=title, xlabel="megapixels", ylabel="ms")
+        axis.xaxis.set_minor_formatter(NullFormatter())
         axis.legend()
     for name in dict.fromkeys(e.program for e in off if e.probes):
         line = [(e.ms, e.divergence_error) for e in off if e.program == name]

@@ -1,0 +1,162 @@
+"""Other ways to a 3×3 convolution on this machine, against XLA's own: Winograd's, and half precision.
+
+    python -m experiments.performance.convolutions [--shapes 512x64x64 512x32x32]
+
+Programs take turns; times are the least of many, by the clock. Winograd's F(4×4, 3×3) (Lavin and Gray
+2016) has a quarter of the products, as 36 matrix products between two linear transforms; its kernels are
+transformed beforehand.
+"""
+
+import argparse
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from experiments import _common
+from experiments.performance.step import seconds
+
+INPUT = (
+    (4, 0, -5, 0, 1, 0),
+    (0, -4, -4, 1, 1, 0),
+    (0, 4, -4, -1, 1, 0),
+    (0, -2, -1, 2, 1, 0),
+    (0, 2, -1, -2, 1, 0),
+    (0, 4, 0, -5, 0, 1),
+)
+KERNEL = np.array(
+    (
+        (1 / 4, 0, 0),
+        (-1 / 6, -1 / 6, -1 / 6),
+        (-1 / 6, 1 / 6, -1 / 6),
+        (1 / 24, 1 / 12, 1 / 6),
+        (1 / 24, -1 / 12, 1 / 6),
+        (0, 0, 1),
+    ),
+    np.float32,
+)
+OUTPUT = ((1, 1, 1, 1, 1, 0), (0, 1, -1, 2, -2, 0), (0, 1, 1, 4, 4, 0), (0, 1, -1, 8, -8, 1))
+"""Of points 0, ±1, ±2 and infinity, for tiles of 6×6 that give 4×4 values."""
+
+SWITCHES = {
+    "oneDNN": {"xla_cpu_use_onednn": True},
+    "YNNPACK": {
+        "xla_cpu_experimental_ynn_fusion_type": "LIBRARY_FUSION_TYPE_INDIVIDUAL_CONVOLUTION"
+    },
+}
+"""Libraries that XLA can be asked to use."""
+
+
+def direct(image: Float[Array, "h w c"], kernel: Float[Array, "3 3 c k"]) -> Float[Array, "h w k"]:
+    """XLA's convolution, zeros around."""
+    return lax.conv_general_dilated(
+        image[None], kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
+    )[0]
+
+
+def transformed(kernel: Float[Array, "3 3 c k"]) -> Float[Array, "6 6 c k"]:
+    """A kernel as `winograd` takes it."""
+    return jnp.einsum("ai,bj,ijck->abck", KERNEL, KERNEL, kernel)
+
+
+def winograd(
+    image: Float[Array, "h w c"], kernel: Float[Array, "6 6 c k"]
+) -> Float[Array, "h w k"]:
+    """As `direct`, of an image whose sides are multiples of 4."""
+    height, width, channels = image.shape
+    rows, columns = height // 4, width // 4
+    cells = jnp.pad(image, ((1, 3), (1, 3), (0, 0)))
+    cells = cells.reshape(rows + 1, 4, columns + 1, 4, channels)
+    lines = [cells[i // 4 : rows + i // 4, i % 4] for i in range(6)]
+    products = []
+    for a, down in enumerate(_combined(INPUT, lines)):
+        values = [down[:, j // 4 : columns + j // 4, j % 4] for j in range(6)]
+        across = _combined(INPUT, values)
+        products.append([value @ kernel[a, b] for b, value in enumerate(across)])
+    down = [_combined(OUTPUT, line) for line in zip(*products, strict=True)]
+    lines = [jnp.stack(_combined(OUTPUT, line), 2) for line in zip(*down, strict=True)]
+    return jnp.stack(lines, 1).reshape(height, width, -1)
+
+
+def _combined(matrix: Sequence[Sequence[float]], values: Sequence[Array]) -> list[Array]:
+    """The matrix times a column of images."""
+    return [
+        functools.reduce(jnp.add, (c * v for c, v in zip(row, values, strict=True) if c))
+        for row in matrix
+    ]
+
+
+def as_product(columns: Float[Array, "n 9c"], kernel: Float[Array, "9c k"]) -> Float[Array, "n k"]:
+    """A convolution of pixels whose neighbours are side by side already, summed in float32."""
+    return lax.dot(columns, kernel, preferred_element_type=jnp.float32)
+
+
+def programs(size: int, channels: int, outputs: int) -> dict[str, tuple[Callable[..., Any], Any]]:
+    """Name -> the compiled program and its arguments."""
+    rng = np.random.default_rng(0)
+    image = jnp.asarray(rng.gamma(1, 1, (size, size, channels)), jnp.float32)
+    kernel = jnp.asarray(rng.normal(size=(3, 3, channels, outputs)) / channels, jnp.float32)
+    half = tuple(a.astype(jnp.bfloat16) for a in (image, kernel))
+    columns = jnp.tile(image.reshape(-1, channels), (1, 9))
+    flat = kernel.reshape(-1, outputs)
+    asked = {
+        "direct": (direct, (image, kernel), {}),
+        **{f"direct, by {name}": (direct, (image, kernel), o) for name, o in SWITCHES.items()},
+        "Winograd": (winograd, (image, transformed(kernel)), {}),
+        "direct, bfloat16": (direct, half, {}),
+        "product alone": (as_product, (columns, flat), {}),
+        "product alone, bfloat16": (
+            as_product,
+            (columns.astype(jnp.bfloat16), flat.astype(jnp.bfloat16)),
+            {},
+        ),
+    }
+    return {
+        name: (jax.jit(f, compiler_options=options).lower(*a).compile(), a)
+        for name, (f, a, options) in asked.items()
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    shapes = ["512x64x64", "512x32x32", "256x96x96"]
+    parser.add_argument("--shapes", nargs="+", default=shapes, help="SIDExCHANNELSxOUTPUTS")
+    parser.add_argument("--repeats", type=int, default=8)
+    arguments = parser.parse_args()
+    print(_common.machine() + "\n", flush=True)
+    rows = []
+    for shape in arguments.shapes:
+        size, channels, outputs = (int(n) for n in shape.split("x"))
+        made = programs(size, channels, outputs)
+        answers = {name: np.asarray(run(*a), np.float32) for name, (run, a) in made.items()}
+        times: dict[str, list[float]] = {name: [] for name in made}
+        for _ in range(arguments.repeats):
+            for name, (run, a) in made.items():
+                times[name].append(seconds(lambda r=run, a=a: r(*a)))
+        truth = answers["direct"]
+        count = 18.0 * size**2 * channels * outputs
+        for name, found in times.items():
+            off = np.sqrt(
+                np.mean((answers[name].reshape(truth.shape) - truth) ** 2) / np.mean(truth**2)
+            )
+            rows.append(
+                (
+                    *(shape, name, f"{1e3 * min(found):.1f}"),
+                    f"{min(found) / min(times['direct']):.2f}",
+                    f"{count / min(found) / 1e9:.0f}",
+                    "" if "alone" in name else f"{off:.0e}",
+                )
+            )
+    header = ("shape", "program", "ms", "direct = 1", "GFLOP/s of the direct's", "off")
+    print(_common.markdown(header, rows))
+
+
+if __name__ == "__main__":
+    main()
