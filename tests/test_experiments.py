@@ -25,9 +25,8 @@ from experiments.fig14 import plot as fig14
 from experiments.main_job import plot as main_job
 from experiments.mc_vs_exact import plot as mc_vs_exact
 from experiments.mc_vs_exact import train as mc_vs_exact_train
-from experiments.performance import convolutions
+from experiments.performance import convolutions, step
 from experiments.performance import run as performance
-from experiments.performance import step
 from experiments.related_work import plot as related_work
 from experiments.stability import run as stability
 from experiments.table1 import plot as table1
