@@ -245,6 +245,9 @@ def test_main_job(command, noisy, tmp_path):
     assert quiet[4:] == wild[4:] == ["1.5", "0.25", "yes"]
     # Of 768 values in [0, 1] three are 100 instead, or 200, and one is 0.1 %.
     assert 0.1 < float(quiet[2]) < float(wild[2]) < 0.3
+    calm = main_job.Risk("calm", 512, share=0.01, mse=3.0, sure=3.3, error=0.0)
+    one, both = cells(main_job.together([calm, calm._replace(share=0.5, mse=1.0, sure=2.7)]), "512")
+    assert (one[1:], both[1:]) == (["without fireflies", "1", "1.1"], ["all", "2", "1.5"])
 
 
 def test_renders_of_normal_noise(command, noisy, tmp_path):

@@ -6,6 +6,7 @@ python -m experiments.main_job.plot runs/main_job
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -46,29 +47,62 @@ def worst(rows: Sequence[Row]) -> str:
     return _common.markdown(("spp", "ratio", "scene"), lines)
 
 
-def risks(rows: Sequence[Row]) -> str:
-    """SURE against the truth where the variances are known well, renders with the least outliers first."""
-    lines = []
+class Risk(NamedTuple):
+    """SURE of a denoised image beside the truth, means over its pixels."""
+
+    scene: str
+    spp: int
+    share: float
+    mse: float
+    sure: float
+    error: float
+
+    @property
+    def quiet(self) -> bool:
+        return self.share <= FIREFLY_SHARE
+
+
+def risks_of(rows: Sequence[Row]) -> list[Risk]:
+    """From 128 spp on, where the variances are known well, renders with the least outliers first."""
+    found = []
     for row in rows:
         if row.method != "denoised" or row.spp < 128:
             continue
-        assert None not in (row.sure, row.sure_error, row.denoised_mse)
         share = firefly_share(np.asarray(pd.read_exr(row.render).variance))
-        ratios = (row.sure / row.denoised_mse, row.sure_error / row.denoised_mse)  # pyright: ignore
-        fireflies = "yes" if share > FIREFLY_SHARE else "no"
-        lines.append((row.scene, row.spp, share, row.denoised_mse, *ratios, fireflies))
+        values = (row.denoised_mse, row.sure, row.sure_error)
+        found.append(Risk(row.scene, row.spp, share, *cast(tuple[float, float, float], values)))
+    return sorted(found, key=lambda risk: risk.share)
+
+
+def risks(found: Sequence[Risk]) -> str:
+    """Each render's."""
     header = ("scene", "spp", "share of 0.1 %", "true MSE", "ratio", "± from pixels", "fireflies")
-    return _common.markdown(header, sorted(lines, key=lambda line: line[2]))
+    lines = ((*r[:4], r.sure / r.mse, r.error / r.mse, "no" if r.quiet else "yes") for r in found)
+    return _common.markdown(header, lines)
+
+
+def together(found: Sequence[Risk]) -> str:
+    """Mean SURE over mean MSE, means over scenes, per spp."""
+    lines = []
+    for spp in sorted({risk.spp for risk in found}):
+        for which, chosen in (("without fireflies", [r for r in found if r.quiet]), ("all", found)):
+            own = [risk for risk in chosen if risk.spp == spp]
+            if own:
+                ratio = sum(r.sure for r in own) / sum(r.mse for r in own)
+                lines.append((spp, which, len(own), ratio))
+    return _common.markdown(("spp", "renders", "scenes", "ratio"), lines)
 
 
 def draw(rows: Sequence[Row], output: Path) -> str:
     """Tables alone."""
     parts = []
     for denoiser, own in _plots.by_denoiser(rows).items():
+        found = risks_of(own)
         parts += [
             f"## {denoiser}, mean over scenes\n\n{means(own)}",
             f"RMSE of the mix over the better of render and denoised, worst scene:\n\n{worst(own)}",
-            f"Mean SURE over true MSE (the reference's own variance taken off):\n\n{risks(own)}",
+            f"Mean SURE over true MSE (the reference's own variance taken off):\n\n{together(found)}",
+            risks(found),
         ]
     return "\n\n".join(parts)
 
