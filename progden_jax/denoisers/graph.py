@@ -13,11 +13,21 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from progden_jax._convolution import same_convolution, upsampled_convolution
 from progden_jax._numeric import own_zero
+from progden_jax.denoisers.layers import (
+    Moments,
+    Weighted,
+    children,
+    convolve,
+    convolve_upsampled,
+    filtered,
+    folds,
+    max_pool,
+    normalized,
+    patches,
+    upsample,
+)
 from progden_jax.denoisers.nodes import (
-    BATCH,
-    BATCH_EPSILON,
     Add,
     Affine,
     BatchNorm,
@@ -76,21 +86,6 @@ class Layered(NamedTuple):
     """Derivative of the transferred colour with respect to x, per pixel and channel."""
     decode: Callable[[Array], Array]
     """From the network's output (H, W, 3) to y, per pixel and channel."""
-
-
-class Moments(NamedTuple):
-    """Mean and variance of each channel over a batch of images."""
-
-    mean: Float[Array, " c"]
-    variance: Float[Array, " c"]
-
-
-class Weighted(NamedTuple):
-    """What a `Filter` computed, which fixes its derivative."""
-
-    weights: Float[Array, "h w taps"]
-    image: Float[Array, "h w c"]
-    result: Float[Array, "h w c"]
 
 
 def levels(nodes: Sequence[Node]) -> list[int]:
@@ -225,14 +220,14 @@ def evaluate(
                 value = inputs
             case Conv():
                 first, *others = node.sources
-                if isinstance(nodes[first], Upsample) and _folds(params[node.layer], precision):
+                if isinstance(nodes[first], Upsample) and folds(params[node.layer], precision):
                     low = values[sources(nodes[first])[0]]
-                    value = _convolve_upsampled(
+                    value = convolve_upsampled(
                         params[node.layer], low, [values[s] for s in others], precision
                     )
                 else:
                     x = jnp.concatenate([values[s] for s in node.sources], axis=-1)
-                    value = _convolve(params[node.layer], x, precision)
+                    value = convolve(params[node.layer], x, precision)
                 if index in bare:
                     extent = jnp.ones((*value.shape[:2], 1), bool)
                     kept[index] = extent if masks is None else masks[level]
@@ -251,7 +246,7 @@ def evaluate(
                 layer = params[node.layer]
                 value = bounded(values[node.source] * layer["scale"] + layer["shift"], level)
             case BatchNorm():
-                value, kept[index] = _normalized(params[node.layer], values[node.source])
+                value, kept[index] = normalized(params[node.layer], values[node.source])
             case Pointwise():
                 x = values[node.source][..., : node.channels]
                 value, slope = jax.jvp(node.function, (x,), (jnp.ones_like(x),))
@@ -267,66 +262,10 @@ def evaluate(
                 value = values[node.sources[0]] + values[node.sources[1]]
             case Filter():
                 mask = None if masks is None else masks[level]
-                kept[index] = _filter(values[node.image], values[node.logits], node.size, mask)
+                kept[index] = filtered(values[node.image], values[node.logits], node.size, mask)
                 value = kept[index].result
         values.append(value)
     return values[-1], kept
-
-
-def _convolve(layer: Any, x: Array, precision: Any) -> Array:
-    kernel = jnp.asarray(layer["kernel"])
-    if precision == "bfloat16":
-        value = lax.conv_general_dilated(
-            x[None].astype(jnp.bfloat16),
-            kernel.astype(jnp.bfloat16),
-            (1, 1),
-            "SAME",
-            dimension_numbers=("NHWC", "HWIO", "NHWC"),
-            preferred_element_type=x.dtype,
-        )[0]
-    else:
-        value = same_convolution(x[None], kernel, precision)[0]
-    return value + layer["bias"] if "bias" in layer else value
-
-
-def _folds(layer: Any, precision: Any) -> bool:
-    """Where the upsampling joins the convolution that reads it. Untried on GPUs."""
-    square = jnp.shape(layer["kernel"])[:2] == (3, 3)
-    return square and precision != "bfloat16" and jax.default_backend() == "cpu"
-
-
-def _convolve_upsampled(layer: Any, low: Array, others: Sequence[Array], precision: Any) -> Array:
-    h, w, _ = low.shape
-    skip = jnp.concatenate(others, axis=-1) if others else jnp.zeros((2 * h, 2 * w, 0), low.dtype)
-    kernel = jnp.asarray(layer["kernel"])
-    value = upsampled_convolution(low[None], skip[None], kernel, precision)[0]
-    return value + layer["bias"] if "bias" in layer else value
-
-
-def _normalized(layer: Any, x: Array) -> tuple[Array, Moments]:
-    mean = lax.pmean(x.mean((0, 1)), BATCH)
-    variance = lax.pmean(((x - mean) ** 2).mean((0, 1)), BATCH)
-    gain = layer["scale"] * lax.rsqrt(variance + BATCH_EPSILON)
-    return (x - mean) * gain + layer["shift"], Moments(mean, variance)
-
-
-def _filter(image: Array, logits: Array, size: int, mask: Array | None) -> Weighted:
-    if mask is None:
-        mask = jnp.ones((*image.shape[:2], 1), bool)
-    border = ((size // 2,) * 2, (size // 2,) * 2, (0, 0))
-    near = patches(jnp.pad(mask, border), size)[..., 0]
-    weights = jax.nn.softmax(jnp.where(near, logits, jnp.finfo(logits.dtype).min), axis=-1)
-    weights = jnp.where(mask, weights, 0)
-    around = patches(jnp.pad(image, border), size)
-    return Weighted(weights, image, (weights[..., None] * around).sum(-2))
-
-
-def patches(x: Float[Array, "*b h w c"], size: int) -> Float[Array, "*b h2 w2 taps c"]:
-    """The size×size pixels in raster order at every place where they all are inside x."""
-    height, width = (n - size + 1 for n in x.shape[-3:-1])
-    rows = jnp.stack([x[..., i : i + height, :, :] for i in range(size)], axis=-2)
-    both = jnp.stack([rows[..., j : j + width, :, :] for j in range(size)], axis=-2)
-    return both.reshape(*x.shape[:-3], height, width, size**2, x.shape[-1])
 
 
 def _not_bounded(nodes: Sequence[Node]) -> set[int]:
@@ -338,27 +277,6 @@ def _not_bounded(nodes: Sequence[Node]) -> set[int]:
         for source in sources(node)
         if isinstance(nodes[source], Conv)
     }
-
-
-def children(x: Float[Array, "h w c"]) -> list[Float[Array, "h2 w2 c"]]:
-    """The four values under each pixel of the next level, in raster order."""
-    h, w, c = x.shape
-    cells = x.reshape(h // 2, 2, w // 2, 2, c)
-    return [cells[:, i, :, j] for i in (0, 1) for j in (0, 1)]
-
-
-def max_pool(x: Float[Array, "h w c"]) -> Float[Array, "h2 w2 c"]:
-    """The largest of each 2×2, whose derivative goes to the first of them in raster order on ties."""
-    best, *others = children(x)
-    for other in others:
-        best = jnp.where(other > best, other, best)
-    return best
-
-
-def upsample(x: Float[Array, "h w c"]) -> Float[Array, "2h 2w c"]:
-    """Each pixel repeated over 2×2."""
-    h, w, c = x.shape
-    return jnp.broadcast_to(x[:, None, :, None], (h, 2, w, 2, c)).reshape(2 * h, 2 * w, c)
 
 
 def _mask_pyramid(inside: Array | None, top: int) -> list[Array] | None:
