@@ -75,8 +75,8 @@ def kept(rows: Iterable[Row]) -> list[Row]:
 
 
 def by_denoiser(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """Denoiser -> its rows and the render's, the methods called alike for each."""
-    return statistics.split(rows, "denoiser")
+    """Denoiser, by name -> its rows and the render's, the methods called alike for each."""
+    return dict(sorted(statistics.split(rows, "denoiser").items()))
 
 
 def of_one_denoiser(rows: Sequence[Row]) -> tuple[str, list[Row]]:

@@ -34,8 +34,11 @@ def table(rows: Sequence[Row]) -> str:
     for row in rows:
         groups[row.spp, row.method].append((row.mse, row.risk))
     lines = []
-    for (spp, image), pairs in sorted(groups.items(), key=lambda group: group[0][0]):
-        mse, risk = np.asarray(pairs, np.float64).T
+    order = [
+        (spp, name) for spp in sorted({spp for spp, _ in groups}) for name in _plots.methods(rows)
+    ]
+    for spp, image in (key for key in order if key in groups):
+        mse, risk = np.asarray(groups[spp, image], np.float64).T
         shown = spp, image, float(np.sqrt(mse.mean()))
         if np.isnan(risk).any():
             lines.append((*shown, "", ""))
