@@ -1,12 +1,17 @@
 """Sums, maxima and Gaussians over square windows, separable and in few passes.
 
-A row's pixels and channels are one axis inside, for loops over three channels are no vectors.
+A row's pixels and channels are one axis inside, for loops over three channels are no vectors. What is called
+many times in a program is compiled by itself, so that it is traced once.
 """
 
+import functools
+
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
+@functools.partial(jax.jit, static_argnames="window")
 def box_sum(values: Float[Array, "h w c"], window: int) -> Float[Array, "h w c"]:
     """Sum over window × window pixels (odd), with zeros outside the image."""
     flat, channels = values.reshape(len(values), -1), values.shape[-1]
@@ -33,6 +38,7 @@ def _fold(padded: Array, axis: int, window: int, step: int, size: int) -> Array:
         power = _slice(power, axis, 0, length) + _slice(power, axis, shift, length)
 
 
+@functools.partial(jax.jit, static_argnames="window")
 def argmax_payload(
     keys: Float[Array, "h w c"], payload: Float[Array, "h w c"], window: int
 ) -> tuple[Float[Array, "h w c"], Float[Array, "h w c"]]:
@@ -59,6 +65,7 @@ def argmax_payload(
     return keys.reshape(shape), payload.reshape(shape)
 
 
+@functools.partial(jax.jit, static_argnames="window")
 def gaussian_sum(values: Float[Array, "h w"], window: int, precision: Array) -> Float[Array, "h w"]:
     """Σ exp(−|δ|²·precision)·values over the window, with zeros outside the image."""
     radius = window // 2

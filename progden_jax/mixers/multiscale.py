@@ -1,6 +1,7 @@
 """A small network that corrects the closed form from what windows of several sizes say."""
 
 import dataclasses
+import functools
 
 import flax.linen as nn
 import jax
@@ -148,9 +149,13 @@ def features(
     """
     counted = jnp.ones_like(x[..., :1]) if inside is None else inside.astype(x.dtype)
 
+    @functools.cache  # tracing takes time, too
+    def pixels(window: int) -> Array:
+        return jnp.maximum(_windows.box_sum(counted, window), 1)
+
     def mean(value: Array, window: int) -> Array:
         value = value if inside is None else jnp.where(inside, value, 0)
-        return _windows.box_sum(value, window) / jnp.maximum(_windows.box_sum(counted, window), 1)
+        return _windows.box_sum(value, window) / pixels(window)
 
     # In units of the image's mean no square here leaves float32's range, nor its derivatives.
     if level is None:
