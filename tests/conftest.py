@@ -1,5 +1,6 @@
 """What many tests share: real frames, small random images, and counts of compilations."""
 
+import functools
 import os
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,6 +14,7 @@ import pytest
 
 import progden_jax as pd
 from progden_jax.compilation import counting_compilations as counting_compilations
+from progden_jax.denoisers import unet
 
 DEMO = Path(pd.__file__).parent / "data" / "demo"
 
@@ -46,6 +48,7 @@ def images() -> SimpleNamespace:
 
 
 divergence = jax.jit(pd.divergence, static_argnames=("f", "method"))
+divergence_and_error = jax.jit(pd.divergence_and_error, static_argnames=("f", "method"))
 """Compiled whole, for functions that are no pytrees: run eagerly, each operation becomes a program."""
 
 
@@ -63,16 +66,29 @@ def drawn(form: Any, seed: int = 0) -> Any:
     return jax.tree.map(one, form)
 
 
+def narrow_oidn(
+    inputs: tuple[str, ...] = (), *, size: str = "small", width: int = 6
+) -> pd.denoisers.OIDN:
+    """OIDN's layers, few channels wide and random: as far-sighted as its networks, and quick."""
+    *hidden, last = unet.shapes(size)
+    shapes = dict.fromkeys(hidden, (3, width)) | {last: (3, 3)}
+    he = functools.partial(
+        pd.denoisers.UNet.he_params, inputs=inputs, nodes=unet.graph(shapes), shapes=shapes
+    )
+    params = drawn(jax.eval_shape(he, jax.random.key(0)))
+    for layer in params.values():
+        layer["kernel"] *= np.float32(2**0.5)
+    params[last]["bias"] += np.float32(0.3)  # a ReLU follows
+    return pd.denoisers.OIDN(params, inputs)
+
+
 def dense_jacobian_diagonal(f, x: np.ndarray) -> np.ndarray:
     """∂f_pc/∂x_pc in float64 from the whole Jacobian."""
     with jax.enable_x64(True):
-        n = x.size
-
         # The unit vectors are an argument: as constants XLA would fold them through the whole of f.
         @jax.jit
-        def along(x, unit):
-            return jnp.vdot(jax.jvp(f, (x,), (unit,))[1], unit)
+        def diagonal(x, units):
+            return jax.lax.map(lambda unit: jnp.vdot(jax.jvp(f, (x,), (unit,))[1], unit), units)
 
-        units = jnp.eye(n).reshape(n, *x.shape)
-        wide = jnp.asarray(x, jnp.float64)
-        return np.asarray([along(wide, unit) for unit in units]).reshape(x.shape)
+        units = np.eye(x.size).reshape(x.size, *x.shape)
+        return np.asarray(diagonal(np.asarray(x, np.float64), units)).reshape(x.shape)
