@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import dense_jacobian_diagonal
+from conftest import dense_jacobian_diagonal, divergence, divergence_and_error, narrow_oidn
 
 import progden_jax as pd
 from progden_jax.denoisers import graph, unet
@@ -180,9 +180,7 @@ def network(nodes, sizes=(3,), seed=0, auxiliary=0):
 
 
 NETWORKS = {
-    "u-net, 1 level": network(u_net(1, 1)),
     "u-net, 2 levels, auxiliary": network(u_net(2, 1), seed=1, auxiliary=4),
-    "u-net, 3 levels": network(u_net(3, 1), seed=3),
     "plain, 5×5 and 3×3": network(PLAIN, sizes=(5, 3), seed=5),
     "deep residual": network(deep_residual(2), sizes=(3, 1), seed=7),
     "kernels": network(
@@ -221,7 +219,7 @@ def test_any_function_in_float64(algorithm, reach, chunk):
         x = jnp.asarray(np.random.default_rng(0).normal(size=(7, 9, 3)))
         variance = jnp.abs(x)
         method = pd.Exact(algorithm, reach=reach, chunk=chunk)
-        found = pd.divergence_and_error(blur, x, variance, method=method)
+        found = divergence_and_error(blur, x, variance, method=method)
         expected = np.asarray(variance) * dense_jacobian_diagonal(blur, x)
         np.testing.assert_allclose(found.divergence, expected, rtol=1e-12, atol=1e-14)
         assert not np.asarray(found.standard_error).any()
@@ -231,15 +229,14 @@ def test_coloring_needs_its_whole_reach():
     """One pixel less than the reach gives another answer: the test above can fail."""
     x = jnp.asarray(np.random.default_rng(0).normal(size=(7, 9, 3)), jnp.float32)
     one = jnp.ones_like(x)
-    short = pd.divergence(blur, x, one, method=pd.Exact("coloring", reach=(1, 1)))
+    short = divergence(blur, x, one, method=pd.Exact("coloring", reach=(1, 1)))
     assert np.abs(short - dense_jacobian_diagonal(blur, x)).max() > 1e-3
 
 
-def test_cone_equals_basis_on_oidn(real_frame):
+def test_cone_equals_basis_on_oidns_layers(real_frame):
     """At an odd size with two cells, borders included, in float32."""
     frame = jax.tree.map(lambda a: a[40:45, 30:47] if a.ndim else a, real_frame)
-    denoiser = pd.denoisers.load("oidn-hdr-alb-nrm-small")
-    f = denoiser.bind(frame)
+    f = narrow_oidn(("albedo", "normal")).bind(frame)
     found = [
         np.asarray(pd.divergence(f, frame.color, frame.variance, method=pd.Exact(algorithm)))
         for algorithm in ("cone", "basis")
@@ -292,9 +289,9 @@ def test_auto_takes_the_cheapest(real_frame):
     by_rows = functools.partial(jax.lax.map, jnp.tanh)
     assert pd.Exact().cost(by_rows, frame.color) == {"basis": 24 * 24 * 3}
     assert pd.Exact(reach=(2, 1)).cost(blur, frame.color)["coloring"] == 27
-    one = jnp.ones_like(frame.color)
-    found = pd.divergence(blur, frame.color, one, method=pd.Exact(reach=(2, 1)))
-    expected = dense_jacobian_diagonal(blur, frame.color)
+    x = np.asarray(frame.color)[:8, :9]
+    found = divergence(blur, x, np.ones_like(x), method=pd.Exact(reach=(2, 1)))
+    expected = dense_jacobian_diagonal(blur, x)
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-5)
 
 
@@ -329,7 +326,7 @@ def test_windows_of_oidn_are_those_of_the_design():
 
 
 def test_exact_in_the_pipeline(real_frame):
-    frame = jax.tree.map(lambda a: a[:16, :15] if a.ndim else a, real_frame)
+    frame = jax.tree.map(lambda a: np.asarray(a)[:8, :7] if a.ndim else a, real_frame)
     denoiser = pd.FunctionDenoiser(blur)
     exact = pd.progressive_denoise(frame, denoiser, method=pd.Exact("coloring", reach=(2, 1)))
     expected = np.asarray(frame.variance) * dense_jacobian_diagonal(blur, np.asarray(frame.color))
