@@ -5,12 +5,17 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from typing import ClassVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import Mesh
 
 import progden_jax as pd
+from progden_jax.training.config import RunConfig
+from progden_jax.training.step import make_start, make_step
 
 
 def job(shape=(150, 90)):
@@ -60,6 +65,7 @@ def test_simulated_devices():
 
 
 def on_three_devices(_):
+    training_on_two_is_training_on_one()
     devices = jax.devices()
     assert len(devices) == 3
     frame, network, how = job()
@@ -79,6 +85,41 @@ def on_three_devices(_):
     for found, given in zip(batch, frames, strict=True):
         assert_same(found, pd.progressive_denoise(given, network, **how))
     assert [result.skipped.computed > 0 for result in batch] == [True, True, False, True]
+
+
+class Line:
+    """A line to fit to noisy points of a line."""
+
+    kind, items = "line", range(0)
+    config = RunConfig(steps=5, batch=4, log_every=5, evaluate_every=9)
+    arrays: ClassVar = {"x": np.linspace(0, 1, 8, dtype=np.float32)}
+
+    def init(self, key):
+        return {"slope": jnp.zeros(()), "offset": jnp.zeros(())}
+
+    def example(self, arrays, index, key):
+        x = arrays["x"][index]
+        return {"x": x, "y": 3 * x + 0.1 * jax.random.normal(key)}
+
+    def loss(self, params, batch):
+        error = params["slope"] * batch["x"] + params["offset"] - batch["y"]
+        return (error**2).mean(), {}
+
+
+def training_on_two_is_training_on_one():
+    """The same examples, the same weights but for rounding."""
+    states = []
+    for count in (1, 2):
+        devices = jax.devices()[:count]
+        assert len(devices) == count
+        step = make_step(Line(), Mesh(np.asarray(devices), ("batch",)) if count > 1 else None)
+        state = make_start(Line())(jax.random.key(0))
+        for _ in range(5):
+            state, scalars = step(state, Line.arrays, jax.random.key(1), jnp.asarray([0, 3, 5, 7]))
+        states.append((state.params, scalars))
+    one, two = (jax.tree.map(np.asarray, s) for s in states)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), one, two)
+    assert one[0]["slope"] > 0
 
 
 def test_processes_on_loopback():

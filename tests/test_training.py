@@ -3,18 +3,13 @@
 import dataclasses
 import functools
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
-from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import counting_compilations
-from jax.sharding import Mesh
 
 import progden_jax as pd
 from progden_jax import mixers
@@ -34,7 +29,6 @@ from progden_jax.training import augment as augmenting
 from progden_jax.training.estimates import EstimateCache
 from progden_jax.training.index import index, split
 from progden_jax.training.mixer_task import swapped_alpha
-from progden_jax.training.step import make_start, make_step
 
 SIZE = 24
 
@@ -626,57 +620,6 @@ def test_command(trainer, folder, tmp_path, monkeypatch, capsys):
     ):
         assert main(wrong) == 2
         assert message in capsys.readouterr().err
-
-
-def test_two_devices_train_as_one(tmp_path):
-    """In a process of its own, for the number of devices is fixed when JAX starts."""
-    environment = {
-        **os.environ,
-        "JAX_PLATFORMS": "cpu",
-        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2",
-        "PYTHONPATH": os.pathsep.join(sys.path),
-    }
-    command = [
-        sys.executable,
-        "-c",
-        f"import test_training as t; t.train_on_devices({str(tmp_path)!r})",
-    ]
-    subprocess.run(command, check=True, env=environment, cwd=Path(__file__).parent, timeout=300)
-    assert (tmp_path / "done").exists()
-
-
-def train_on_devices(folder: str) -> None:
-    """Fit a line on one device and on two: the same examples, the same weights but for rounding."""
-
-    class Line:
-        kind, items = "line", range(0)
-        config = config.RunConfig(steps=5, batch=4, log_every=5, evaluate_every=9)
-        arrays: ClassVar = {"x": np.linspace(0, 1, 8, dtype=np.float32)}
-
-        def init(self, key):
-            return {"slope": jnp.zeros(()), "offset": jnp.zeros(())}
-
-        def example(self, arrays, index, key):
-            x = arrays["x"][index]
-            return {"x": x, "y": 3 * x + 0.1 * jax.random.normal(key)}
-
-        def loss(self, params, batch):
-            error = params["slope"] * batch["x"] + params["offset"] - batch["y"]
-            return (error**2).mean(), {}
-
-    states = []
-    for count in (1, 2):
-        devices = jax.devices()[:count]
-        assert len(devices) == count
-        step = make_step(Line(), Mesh(np.asarray(devices), ("batch",)) if count > 1 else None)
-        state = make_start(Line())(jax.random.key(0))
-        for _ in range(5):
-            state, scalars = step(state, Line.arrays, jax.random.key(1), jnp.asarray([0, 3, 5, 7]))
-        states.append((state.params, scalars))
-    one, two = (jax.tree.map(np.asarray, s) for s in states)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), one, two)
-    assert one[0]["slope"] > 0
-    Path(folder, "done").touch()
 
 
 def test_training_a_denoiser(folder, tmp_path):
