@@ -373,13 +373,13 @@ def test_a_run_that_lacks_what_a_plot_shows_is_told(command, noisy, tmp_path):
         command(fig14, run, "--output", tmp_path)
 
 
-def test_stability(command, monkeypatch, tmp_path):
+def test_stability(command, monkeypatch, tiny, tmp_path):
     """One small crop: derivatives keep float32's digits on every input, differences on none."""
     options = {
         "--data": DEMO,
         "--spp": 8,
         "--size": 16,
-        "--denoiser": "oidn-hdr-small",
+        "--denoiser": tiny,
         "--networks": "float32",
         "--epsilons": 1e-4,
         "--scales": 1e-6,
@@ -452,7 +452,7 @@ def test_convolutions(command):
 def test_performance(command, tiny, tmp_path):
     """Without competitors: every part has a time, and the convolutions their operations."""
     output = tmp_path / "found.csv"
-    words = ("--sizes", "64x64", "--probes", 1, "--denoiser", tiny, "--rounds", 1)
+    words = ("--sizes", "32x32", "--probes", 1, "--denoiser", tiny, "--rounds", 1)
     words += ("--against", "--error-size", "none", "--no-processes", "--output", output)
     printed = command(performance, "--data", DEMO, "--spp", 32, *words)
     rows = {row["part"]: row for row in _common.read_csv(output)}
@@ -462,5 +462,5 @@ def test_performance(command, tiny, tmp_path):
     assert all(float(row["ms"]) > 0 for row in rows.values())
     once, twice = (float(rows[part]["operations_1e9"]) for part in ("forward pass", "divergence"))
     assert twice == 2 * once
-    assert cells(printed, "mixing net / operations, 64x64") != []
+    assert cells(printed, "mixing net / operations, 32x32") != []
     assert output.with_suffix(".png").stat().st_size > 10_000
