@@ -81,7 +81,7 @@ def prepare(folder: Path) -> None:
     import progden_jax as pd
     from progden_jax import demo
 
-    corner = np.s_[70:102, 40:72]
+    corner = np.s_[70:86, 40:56]
     (folder / "renders").mkdir()
     for path in sorted(demo.FOLDER.glob("*.exr")):
         frame = pd.read_exr(path)
