@@ -19,8 +19,12 @@ def half(real_frame):
     return frame.replace(variance=variance)
 
 
-def test_half_a_frame_equals_the_dense_answer(half, near_sighted):
-    dense = pd.progressive_denoise(half, near_sighted, outputs=["image", "alpha"], skip=False)
+@pytest.fixture(scope="module")
+def dense(half, near_sighted):
+    return pd.progressive_denoise(half, near_sighted, outputs=["image", "alpha"], skip=False)
+
+
+def test_half_a_frame_equals_the_dense_answer(half, near_sighted, dense):
     found = pd.progressive_denoise(half, near_sighted, outputs=["image", "alpha"])
     assert dense.skipped.pixels == 0
     assert found.skipped.pixels == pytest.approx(150 * 333 / 2, rel=0.1)
@@ -35,8 +39,7 @@ def test_half_a_frame_equals_the_dense_answer(half, near_sighted):
     assert compiled == []
 
 
-def test_windows_in_bounded_memory_are_skipped_too(half, near_sighted):
-    dense = pd.progressive_denoise(half, near_sighted, outputs=["image"], skip=False)
+def test_windows_in_bounded_memory_are_skipped_too(half, near_sighted, dense):
     found = pd.progressive_denoise(half, near_sighted, outputs=["image"], max_memory=25 * 2**20)
     assert found.skipped.pixels > 150 * 333 / 4
     assert_same(found.image, dense.image)
