@@ -35,8 +35,12 @@ class Place(NamedTuple):
 
 def fits(job: Any, frame: Frame, canvas: tuple[int, int], max_memory: int) -> bool:
     """Whether the frame can be computed at once, as far as can be told without compiling."""
-    needed = memory.guess(job.denoiser, job.method) + _pixel_bytes(frame) * len(job.outputs)
+    needed = _guess(job) + _pixel_bytes(frame) * len(job.outputs)
     return canvas[0] * canvas[1] * needed * memory.SLACK <= max_memory
+
+
+def _guess(job: Any) -> float:
+    return memory.guess(job.denoiser, job.method, getattr(job, "mixer", None))
 
 
 def _pixel_bytes(frame: Frame) -> int:
@@ -65,7 +69,7 @@ def within(
             max_memory - kept,
             tiling.smallest_window(reach, step),
             lambda edge: _compiled(job, frame, divergence, edge),
-            memory.guess(job.denoiser, job.method),
+            _guess(job),
         )
         shape = (edge, edge)
     assert shape is not None

@@ -148,13 +148,15 @@ def _tangents_kept(probes: int) -> float:
     return 1.0 if probes == 1 else 1.5
 
 
-def guess(denoiser: Any, method: Any) -> float:
-    """Bytes per pixel that a window's program may take, from the widest layer at full resolution."""
-    widths = [math.prod(leaf.shape[-2:-1]) + leaf.shape[-1] for leaf in _kernels(denoiser)]
+def guess(denoiser: Any, method: Any, mixer: Any = None) -> float:
+    """Bytes per pixel that a window's program may take, from the widest layers at full resolution."""
     probes = getattr(method, "probes", None) or 1
     chunk = getattr(method, "chunk", None) or 1
-    return 4 * max(widths, default=128) * 2.3 * (_tangents_kept(probes) + (chunk - 1))
+    network = _widest(denoiser, 128) * (_tangents_kept(probes) + (chunk - 1))
+    return 4 * 2.3 * max(network, _widest(mixer, 0))
 
 
-def _kernels(denoiser: Any) -> list[Any]:
-    return [leaf for leaf in jax.tree.leaves(denoiser) if getattr(leaf, "ndim", 0) == 4]
+def _widest(network: Any, otherwise: int) -> int:
+    """The most channels that a convolution takes and gives; `otherwise` where there is none."""
+    kernels = (a.shape for a in jax.tree.leaves(network) if getattr(a, "ndim", 0) == 4)
+    return max((taken + given for *_, taken, given in kernels), default=otherwise)

@@ -151,7 +151,7 @@ def test_every_divergence_method_on_kpcn(frame):
 
 
 def test_what_the_divergence_of_a_unet_looks_into():
-    """Its layers are OIDN's, whose cones are tested on real weights."""
+    """Its layers are OIDN's, whose cones are tested."""
     ours, theirs = NETWORKS["unet"], pd.denoisers.load("oidn-hdr-small")
     assert ours.nodes == theirs.nodes
     assert ours.receptive_radius == theirs.receptive_radius == 94

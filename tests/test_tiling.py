@@ -139,6 +139,16 @@ def test_only_what_is_asked_for_is_given(images):
         pd.progressive_denoise(frame, denoiser, outputs="image")
 
 
+def test_the_wider_of_denoiser_and_mixer_is_what_memory_is_guessed_from(near_sighted):
+    """The shipped mixer's first layer takes 54 channels and gives 32; the denoiser's last 8 and 25."""
+    oidn = pd.denoisers.load("oidn-hdr")
+    wide, method = mixers.default_for(oidn), pd.MonteCarlo(probes=1)
+    alone = memory.guess(near_sighted, method)
+    assert memory.guess(near_sighted, method, wide) == pytest.approx(alone * (54 + 32) / (8 + 25))
+    assert memory.guess(near_sighted, method, pd.ClosedForm()) == alone
+    assert memory.guess(oidn, method, wide) == memory.guess(oidn, method)
+
+
 def test_what_cannot_be_cut_says_so(images, real_frame, denoiser):
     frame = mirrored(real_frame, 400, 400)
     with pytest.raises(ValueError, match=r"FunctionDenoiser.*cannot work on tiles"):
