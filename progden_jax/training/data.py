@@ -1,23 +1,28 @@
 """Renders, references and estimates as arrays in memory, one per buffer with the examples stacked."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 import progden_jax as pd
+from progden_jax import subaverages
 from progden_jax.frame import repaired
+from progden_jax.subaverages import SubAverages
 from progden_jax.training.config import Meaning, RunConfig
 from progden_jax.training.estimates import EstimateCache
-from progden_jax.training.index import Item, index, split
+from progden_jax.training.index import Item, earlier, index, split
 
 Progress = Callable[[int, int], None]
 """Called with how many of how many are done."""
 
 
 class Examples(NamedTuple):
-    """`arrays` are (N, H, W, C), but for mean_variance (N,) and divergence (N, draws, H, W, 3)."""
+    """`arrays` are (N, H, W, C), but for mean_variance (N,) and divergence (N, draws, H, W, 3).
+
+    Of B sub-averages, parts and denoised_parts are (N, B, H, W, 3) and shares (N, B).
+    """
 
     items: tuple[Item, ...]
     arrays: dict[str, np.ndarray]
@@ -35,6 +40,7 @@ def load(
     cache: EstimateCache | None = None,
     draws: int = 1,
     auxiliary: Sequence[str] = (),
+    parts: int = 1,
     progress: Progress = lambda done, total: None,
 ) -> Examples:
     """The examples, bad pixels repaired.
@@ -44,11 +50,12 @@ def load(
     cache : gives denoised images, and divergences if it has a method; None leaves them out.
     draws : divergences of so many seeds per render.
     auxiliary : buffers to take besides, of albedo, normal and depth.
+    parts : sub-averages of each render, from those of its scene with fewer samples.
 
     Raises
     ------
     ValueError
-        If sizes differ, or a render lacks a variance or a buffer asked for.
+        If sizes differ, a render lacks a variance or a buffer asked for, or its sub-averages cannot be had.
     """
     rows: dict[str, list] = {}
     references: dict[object, np.ndarray] = {}
@@ -84,6 +91,8 @@ def load(
                 row["divergence"] = np.stack(drawn)
             if found[0].probe is not None:
                 row["probe"], row["tangent"] = found[0].probe, found[0].tangent
+        if parts > 1:
+            row |= _parts(item, frame, parts, variance_of, cache)
         for name, value in row.items():
             rows.setdefault(name, []).append(np.asarray(value, np.float32))
     progress(len(items), len(items))
@@ -96,6 +105,7 @@ def load_split(
     cache: EstimateCache | None = None,
     draws: int = 1,
     auxiliary: Sequence[str] = (),
+    parts: int = 1,
     progress: Progress = lambda done, total: None,
 ) -> tuple[Examples, Examples]:
     """(to train on, held out) of the folders that the configuration names; see `load`.
@@ -119,6 +129,7 @@ def load_split(
         cache=cache,
         draws=draws,
         auxiliary=auxiliary,
+        parts=parts,
         progress=progress,
     )
     if config.crop > min(both.size):
@@ -142,6 +153,37 @@ def _repaired(item: Item, variance_of: Meaning, *, reference: bool = False) -> p
                 f"{item.path} has no variance, and training needs that of the sample mean."
             )
     return repaired(frame)
+
+
+def sub_averages(item: Item, series: Mapping[int, pd.Frame]) -> SubAverages:
+    """Of an item's render, from it and the `earlier` ones of its nested series by samples per pixel.
+
+    Raises
+    ------
+    ValueError
+        If it does not go on from them.
+    """
+    frames = [frame.replace(spp=spp) for spp, frame in sorted(series.items())]
+    try:
+        return subaverages.averaged(subaverages.nested(frames))
+    except ValueError as error:
+        raise ValueError(f"{item.path}: {error}") from None
+
+
+def _parts(
+    item: Item, frame: pd.Frame, count: int, variance_of: Meaning, cache: EstimateCache | None
+) -> dict[str, Any]:
+    """The render's sub-averages as arrays."""
+    series = {
+        spp: _repaired(item._replace(path=path), variance_of)
+        for spp, path in earlier(item, count).items()
+    }
+    found = sub_averages(item, {**series, item.spp: frame})
+    differences = found.differences["color"]
+    row = {"parts": frame.color + differences, "shares": found.shares}
+    if cache is not None:
+        row["denoised_parts"] = cache.parts(frame, differences, found.shares)
+    return row
 
 
 def _size(size: Sequence[int]) -> str:
