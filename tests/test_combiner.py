@@ -441,7 +441,7 @@ def test_training_lowers_the_error(trained):
 def divided(renders, tmp_path_factory):
     """The task and the outcome of two steps with sub-averages of 4 and of 60 samples."""
     how = {"options": {"layers": 1, "layer_size": 1, "window": 3, "inputs": ["variance"]}}
-    how |= {"steps": 2, "evaluate_every": 2, "crop": 8, "buffers": 2, "spp": [64]}
+    how |= {"steps": 2, "evaluate_every": 2, "crop": 8, "buffers": 2}
     cache = tmp_path_factory.mktemp("cache")
     task = CombinerTask(chosen(renders, **how), denoiser=COLUMN, cache_folder=cache)
     return task, Trainer(task).run(tmp_path_factory.mktemp("divided") / "run")
@@ -451,6 +451,7 @@ def test_training_on_sub_averages(divided, renders):
     """Made of what a render gained, denoised each by itself, kept in the cache, in random order."""
     task, outcome = divided
     assert combiner.read(outcome.weights).network.buffers == 2
+    assert {item.spp for item in task.items} == {64}
     assert np.isfinite(float(outcome.state.best_score))
     scene = next(n for n, item in enumerate(task.items) if item.scene == "one")
     a, x = (np.asarray(pd.read_exr(renders / f"one_{n:06}spp.exr").color) for n in (4, 64))
@@ -516,7 +517,7 @@ def test_configurations(renders):
         ({"options": {"buffers": 2}}, "options is {'buffers': 2}: .*multiple values"),
         ({"buffers": 0}, "buffers is 0, expected a whole number of at least 1"),
         (
-            {"buffers": 2},
+            {"buffers": 2, "spp": [4]},
             "000004spp.exr: of fewer than 4 samples per pixel there are renders of none",
         ),
         ({"exposure_stops": 1.0}, "nfor does not follow exposure"),

@@ -1,5 +1,6 @@
 """Renders, references and estimates as arrays in memory, one per buffer with the examples stacked."""
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -110,6 +111,8 @@ def load_split(
 ) -> tuple[Examples, Examples]:
     """(to train on, held out) of the folders that the configuration names; see `load`.
 
+    Where it names no samples per pixel, the lowest of each scene that nothing divides are left out.
+
     Raises
     ------
     ValueError
@@ -122,6 +125,9 @@ def load_split(
                 "folder, or rename it if it is not."
             )
     items = index(config.data, spp=config.spp, reference_spp=config.reference_spp)
+    if not config.spp:
+        by_scene = itertools.groupby(items, key=lambda item: item.scene)
+        items = [item for _, own in by_scene for item in list(own)[parts - 1 :]]
     training, held = split(items, share=config.held_out, scenes=config.held_out_scenes)
     both = load(
         training + held,
