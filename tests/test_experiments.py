@@ -290,7 +290,7 @@ def test_limit_of_related_work(command, noisy, tmp_path):
     (tmp_path / "half.py").write_text("def half(x):\n    return x / 2\n")
     methods = [{"image": "render"}, {"denoiser": "half.py:half", "image": "denoised"}]
     (tmp_path / "two.yaml").write_text(json.dumps({"list": methods}))
-    words = ("--sweep", tmp_path / "two.yaml", "--data", noisy, "--crop", 16)
+    words = ("--sweep", tmp_path / "two.yaml", "--data", noisy)
     printed = command(related_work_limit, *words)
     expected = {"render": [], "half": []}
     for spp in (512, 4096):

@@ -2,7 +2,7 @@
 
 python -m experiments.related_work.limit
 
-Methods and scenes are those of sweep.yaml, or of another such file. Buffers that references lack are those of
+Methods and scenes are those of limit.yaml, or of another such file. Buffers that references lack are those of
 the 512 spp renders, where the estimate stands beside what is measured.
 """
 
@@ -19,9 +19,11 @@ from experiments import _common
 from experiments.related_work.plot import name
 from progden_jax import evaluation
 from progden_jax.evaluation.images import estimate, mean_of, show
+from progden_jax.evaluation.plan import Plan
 from progden_jax.frame import centre, repaired
+from progden_jax.training.index import Item
 
-SWEEP = Path(__file__).with_name("sweep.yaml")
+SWEEP = Path(__file__).with_name("limit.yaml")
 
 SPP = 512
 
@@ -41,30 +43,31 @@ def main() -> None:
     )
     parser.add_argument("--sweep", type=Path, default=SWEEP, help="file of methods and scenes")
     parser.add_argument("--data", type=Path, help="folder of NAME_SSSSSSspp.exr files")
-    parser.add_argument("--crop", type=int, default=64, help="edge in pixels of the middles")
-    parser.add_argument("--probes", type=int, default=4, help="for the estimate of a mix")
+    parser.add_argument("--probes", type=int, default=4, help="for mixes; 0: as if α were constant")
     arguments = parser.parse_args()
     data: dict[str, Any] = {"spp": [SPP]}
     if arguments.data is not None:
         data |= {"data": [str(arguments.data)], "scenes": []}
     plan = evaluation.load(arguments.sweep, data=data)
     pd.enable_compilation_cache()
-    print(f"{_common.machine()}\n{len(plan.items)} scenes, the middle {arguments.crop} pixels\n")
-    rows = [row for item in plan.items for row in of_scene(item, plan, arguments)]
+    print(f"{_common.machine()}\n{len(plan.items)} scenes\n")
+    rows = [row for item in plan.items for row in of_scene(item, plan, arguments.probes)]
     print(table(rows))
 
 
-def of_scene(item: Any, plan: Any, arguments: argparse.Namespace) -> Iterator[Found]:
+def of_scene(item: Item, plan: Plan, probes: int) -> Iterator[Found]:
     """Every method on the render and on its reference."""
     frame = pd.read_exr(item.path).replace(spp=None)
     truth = pd.read_exr(item.reference, auxiliary=False).replace(spp=None)
-    frame, truth = (centre(repaired(f), arguments.crop) for f in (frame, truth))
+    frame, truth = repaired(frame), repaired(truth)
+    if plan.data.crop:
+        frame, truth = (centre(f, plan.data.crop) for f in (frame, truth))
     best = frame.replace(color=truth.color, variance=truth.variance)
     reference = np.asarray(truth.color)
     for spp, given in ((SPP, frame), (_common.REFERENCE_SPP, best)):
         made: dict[Any, Any] = {}
         for method in plan.methods:
-            settings = dataclasses.replace(method.settings, risk_probes=arguments.probes)
+            settings = dataclasses.replace(method.settings, risk_probes=probes)
             same = settings.estimate()
             if settings.image != "render" and same not in made:
                 made[same] = estimate(given, settings, None)
