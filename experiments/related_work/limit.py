@@ -89,12 +89,11 @@ def table(rows: list[Found]) -> str:
     lines = []
     for method in dict.fromkeys(row.method for row in rows):
         own = [row for row in rows if row.method == method]
-        at_spp, at_most = (
-            [row for row in own if row.spp == spp] for spp in (SPP, _common.REFERENCE_SPP)
+        measured = [row.measured for row in own if row.measured is not None]
+        estimated = (
+            [row.estimated for row in own if row.spp == spp] for spp in (SPP, _common.REFERENCE_SPP)
         )
-        measured = float(np.mean([row.measured for row in at_spp]))
-        estimated = (float(np.mean([row.estimated for row in part])) for part in (at_spp, at_most))
-        lines.append((method, measured, *estimated))
+        lines.append((method, *(float(np.mean(found)) for found in (measured, *estimated))))
     return _common.markdown(
         (
             "RMSE",

@@ -175,7 +175,7 @@ def read_parts(item: Item, frame: "Frame", read: "Settings", outcome: "Outcome")
     if frame.size != found.frame.size or not are_halves(np.asarray(frame.color), colors, shares):
         raise Failure(
             f"{item.input}: --halves {' '.join(map(str, item.halves))}: the input is neither their mean nor "
-            f"one of them; give {count} renders of its samples' parts."
+            f"one of them; give {count} renders that share its samples."
         )
     variance = found.frame.variance if frame.variance is None else frame.variance
     kept = {name: d for name, d in found.differences.items() if getattr(frame, name) is not None}

@@ -186,7 +186,7 @@ def _parts(
     }
     found = sub_averages(item, {**series, item.spp: frame})
     differences = found.differences["color"]
-    row = {"parts": frame.color + differences, "shares": found.shares}
+    row: dict[str, Any] = {"parts": frame.color + differences, "shares": found.shares}
     if cache is not None:
         row["denoised_parts"] = cache.parts(frame, differences, found.shares)
     return row
