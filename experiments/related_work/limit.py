@@ -31,6 +31,7 @@ SPP = 512
 class Found(NamedTuple):
     """Root mean squared errors of a method on a render, the measured one without the reference's noise."""
 
+    scene: str
     method: str
     spp: int
     estimated: float
@@ -43,7 +44,7 @@ def main() -> None:
     )
     parser.add_argument("--sweep", type=Path, default=SWEEP, help="file of methods and scenes")
     parser.add_argument("--data", type=Path, help="folder of NAME_SSSSSSspp.exr files")
-    parser.add_argument("--probes", type=int, default=4, help="for mixes; 0: as if α were constant")
+    parser.add_argument("--probes", type=int, default=0, help="for mixes; 0: as if α were constant")
     arguments = parser.parse_args()
     data: dict[str, Any] = {"spp": [SPP]}
     if arguments.data is not None:
@@ -76,7 +77,7 @@ def of_scene(item: Item, plan: Plan, probes: int) -> Iterator[Found]:
             if spp == SPP:
                 squared = (np.asarray(shown.image, np.float64) - reference) ** 2
                 measured = _root(squared.mean() - mean_of(truth.variance))
-            yield Found(name(settings.flat()), spp, _root(shown.risk), measured)
+            yield Found(item.scene, name(settings.flat()), spp, _root(shown.risk), measured)
 
 
 def _root(square: Any) -> float:
@@ -85,21 +86,26 @@ def _root(square: Any) -> float:
 
 
 def table(rows: list[Found]) -> str:
-    """Means over the scenes."""
+    """Means over the scenes, and in how many of them the estimate is above the render's."""
     lines = []
+    most = [row for row in rows if row.spp == _common.REFERENCE_SPP]
+    render = {row.scene: row.estimated for row in most if row.method == "render"}
     for method in dict.fromkeys(row.method for row in rows):
         own = [row for row in rows if row.method == method]
         measured = [row.measured for row in own if row.measured is not None]
         estimated = (
             [row.estimated for row in own if row.spp == spp] for spp in (SPP, _common.REFERENCE_SPP)
         )
-        lines.append((method, *(float(np.mean(found)) for found in (measured, *estimated))))
+        means = (float(np.mean(found)) for found in (measured, *estimated))
+        above = sum(row.estimated > render[row.scene] for row in most if row.method == method)
+        lines.append((method, *means, above))
     return _common.markdown(
         (
             "RMSE",
             f"{SPP} spp",
             f"{SPP} spp, estimated",
             f"{_common.REFERENCE_SPP} spp, estimated",
+            f"scenes above the render, of {len(render)}",
         ),
         lines,
     )
