@@ -10,7 +10,7 @@ How to use it: `progden_jax.guides`. What is not imported with the package: `pro
 
 __version__ = "0.1.0"
 
-from progden_jax import combiner, denoisers, metrics, transfer
+from progden_jax import combiner, denoisers, metrics, subaverages, transfer
 from progden_jax.batch import denoise_batch
 from progden_jax.compilation import enable_compilation_cache
 from progden_jax.denoisers import Denoiser, FunctionDenoiser
@@ -74,6 +74,7 @@ __all__ = [
     "progressive_denoise",
     "read_exr",
     "repair",
+    "subaverages",
     "sure",
     "t_bound",
     "transfer",

@@ -131,8 +131,8 @@ class Repairs(NamedTuple):
     nonfinite_auxiliary: Int[Array, ""]
 
 
-def share(frame: Frame, count: int) -> Frame:
-    """The frame with the variance and the samples of one of so many equal parts of its samples."""
+def share(frame: Frame, count: Any) -> Frame:
+    """The frame with the variance and the samples of one part of its samples, of which it has `count`."""
     variance, spp = frame.variance, frame.spp
     return frame.replace(
         variance=None if variance is None else count * variance,

@@ -3,12 +3,14 @@
 import numpy as np
 
 
-def combine(noisy, denoised, weights, window, reliability=None, trust=None):
+def combine(noisy, denoised, weights, window, reliability=None, trust=None, shares=None):
     """Eq. 14 of (B, H, W, 3) sub-averages; weights (B, window², H, W), offsets in raster order.
 
-    With them, the reliability (B, H, W) of each value and the weight (H, W) of the mean denoised one.
+    With them, the reliability (B, H, W) of each value, the weight (H, W) of the mean denoised one, and the
+    shares (B,) of the samples, by which the sub-averages count.
     """
     buffers, height, width, _ = noisy.shape
+    counts = np.ones(buffers) if shares is None else np.asarray(shares) * buffers
     radius = window // 2
     result = np.zeros(noisy.shape[1:])
     for c in np.ndindex(height, width):
@@ -18,7 +20,7 @@ def combine(noisy, denoised, weights, window, reliability=None, trust=None):
                 there = (c[0] + i - radius, c[1] + j - radius)
                 if not (0 <= there[0] < height and 0 <= there[1] < width):
                     continue
-                weight = weights[b, offset, *c]
+                weight = counts[b] * weights[b, offset, *c]
                 if reliability is not None:
                     weight *= reliability[b, *there]
                 norm += weight
@@ -27,7 +29,7 @@ def combine(noisy, denoised, weights, window, reliability=None, trust=None):
                 else:
                     total += weight * (noisy[b, *there] + denoised[b, *c] - denoised[b, *there])
         if trust is not None:
-            total += trust[c] * denoised[:, *c].mean(0)
+            total += trust[c] * np.average(denoised[:, *c], axis=0, weights=counts)
             norm += trust[c]
         result[c] = total / norm
     return result
@@ -54,15 +56,16 @@ def relative_depth(depth, window):
     return result
 
 
-def network(settings, params, noisy, denoised, frame):
+def network(settings, params, noisy, denoised, frame, shares=None):
     """The combined image of (B, H, W, 3) sub-averages."""
     noisy, denoised = noisy.astype(np.float64), denoised.astype(np.float64)
     level = np.maximum(denoised, 0)
+    mean = np.average(level, axis=0, weights=shares)
     buffers = {
         "albedo": lambda: frame.albedo,
         "normal": lambda: frame.normal,
         "depth": lambda: relative_depth(np.asarray(frame.depth, np.float64), settings.window),
-        "variance": lambda: np.log1p(np.sqrt(frame.variance) / (level.mean(0) + 0.01)),
+        "variance": lambda: np.log1p(np.sqrt(frame.variance) / (mean + 0.01)),
     }
     seen = [
         *np.log1p(np.maximum(noisy, 0)),
@@ -78,4 +81,4 @@ def network(settings, params, noisy, denoised, frame):
     shape = (settings.buffers, settings.window**2, *logits.shape[1:])
     further = (np.exp(logits[count:-1]), np.exp(logits[-1])) if settings.robust else ()
     weights = np.exp(logits[:count]).reshape(shape)
-    return combine(noisy, denoised, weights, settings.window, *further)
+    return combine(noisy, denoised, weights, settings.window, *further, shares=shares)

@@ -10,7 +10,7 @@ import pytest
 from conftest import drawn
 
 import progden_jax as pd
-from progden_jax import adaptation
+from progden_jax import adaptation, subaverages
 from progden_jax.adaptation import _blocks, _noise, combination
 
 SMALL = adaptation.PostCorrection(window=3, layers=2, width=4, patch=8, steps=1)
@@ -447,6 +447,11 @@ def test_noise_that_channels_share():
             "has no variance",
         ),
         (lambda f: adaptation.halves(f, frame_of(0, size=(4, 4))[0]), "b.color has shape"),
+        (
+            lambda f: adaptation.halves(f.replace(spp=8.0), f.replace(spp=24.0)),
+            "the halves have 8 and 24 samples per pixel, expected equal ones",
+        ),
+        (lambda f: adaptation.paired(subaverages.averaged([f] * 3)), "there are 3 sub-averages"),
         (lambda f: adaptation.adapt(pd.Frame(f.color[:1, :1], f.color[:1, :1]), BLUR), "too few"),
         (lambda f: adaptation.PostCorrection(window=4), "window is 4"),
         (lambda f: adaptation.PostCorrection(rate=0), "rate is 0"),

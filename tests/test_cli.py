@@ -829,6 +829,7 @@ CONTRADICTIONS = [
     "--halves a.exr b.exr",
     "--denoiser nfor --combiner nfor --halves a.exr b.exr",
     "--post-correct --halves a.exr",
+    "--post-correct --halves a.exr ./a.exr",
     "--post-correct --halves a.exr b.exr --variance-from a.exr b.exr",
 ]
 USAGE |= {c: ["denoise", "{in}", "-o", "{out}", *c.split()] for c in CONTRADICTIONS}

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import progden_jax as pd
-from progden_jax import adaptation
+from progden_jax import adaptation, combiner
 from progden_jax.cli import main
 from progden_jax.exr import read_exr, write_exr
 
@@ -134,6 +134,55 @@ def test_the_input_may_be_one_of_the_halves(halves, few_layers, denoise):
     status, (told,), _ = denoise(halves / "other.exr", "-o", halves / "no.exr", *words, *pair)
     assert (status, "neither their mean nor one of them" in told["error"]) == (1, True)
     assert not (halves / "no.exr").exists()
+
+
+@pytest.fixture(scope="module")
+def combines_two(network, tmp_path_factory):
+    """A file of a combiner's weights for two sub-averages."""
+    form = combiner.KernelNetwork(layers=1, layer_size=1, window=3, buffers=2, inputs=("variance",))
+    weights = jax.jit(form.init)(jax.random.key(0))
+    path = tmp_path_factory.mktemp("combiner") / "two.safetensors"
+    combiner.save(path, combiner.DeepCombiner(weights, pd.denoisers.load(network), form))
+    return path
+
+
+def test_sub_averages_are_combined(halves, network, combines_two, denoise):
+    """As by the library, whether the input is what they make up or one of them."""
+    pair = [halves / "a.exr", halves / "b.exr"]
+    made = combiner.load(combines_two, pd.denoisers.load(network))
+    frame, buffered = combiner.of_buffers(made, [read_exr(path) for path in pair])
+    words = ["--combiner", combines_two, "--halves", *pair, "--save", "denoised,variance"]
+    for name in ("whole.exr", "a.exr"):
+        out = halves / f"of_{name}"
+        status, (told,), err = denoise(halves / name, "-o", out, *words)
+        assert (status, err) == (0, "")
+        assert told["denoiser"] == "net+combiner"
+        written = pd.exr.read_layers(out)
+        np.testing.assert_allclose(written["denoised"], buffered(frame), rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(written["noisy_variance"], frame.variance, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("names", "flags", "message"),
+    [
+        ("", "", "combines 2 sub-averages of the samples: name as many renders with --halves"),
+        ("a.exr b.exr whole.exr", "", "--halves names 3 renders, expected 2"),
+        ("a.exr a.exr", "", "--halves names one render twice"),
+        ("a.exr b.exr", "--post-correct", "--post-correct fit to one image: leave one out"),
+        ("a.exr b.exr", "--variance-from b.exr", "both name other renders"),
+        ("a.exr b.exr", "--max-memory 1GiB", "need them whole"),
+    ],
+)
+def test_what_does_not_go_with_sub_averages(
+    halves, combines_two, denoise, monkeypatch, names, flags, message
+):
+    monkeypatch.chdir(halves)
+    given = ["--halves", *names.split()] if names else []
+    words = ["--combiner", combines_two, *given, *flags.split()]
+    status, told, err = denoise("whole.exr", "-o", "out.exr", *words)
+    assert (status, told) == (2, None)
+    assert message in err
+    assert not (halves / "out.exr").exists()
 
 
 def test_an_interrupt_leaves_nothing(halves, denoise, monkeypatch):

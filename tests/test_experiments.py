@@ -2,6 +2,7 @@
 
 import csv
 import itertools
+import json
 import math
 import shutil
 import sys
@@ -27,6 +28,7 @@ from experiments.mc_vs_exact import plot as mc_vs_exact
 from experiments.mc_vs_exact import train as mc_vs_exact_train
 from experiments.performance import convolutions, step
 from experiments.performance import run as performance
+from experiments.related_work import limit as related_work_limit
 from experiments.related_work import plot as related_work
 from experiments.stability import run as stability
 from experiments.table1 import plot as table1
@@ -281,6 +283,27 @@ def test_related_work(command, noisy, tmp_path, name):
     assert (tmp_path / f"{stem}.png").stat().st_size > 10_000
     methods = {row["method"] for row in _common.read_csv(tmp_path / f"{stem}.csv")}
     assert {"render", "nfor", "nfor, combined, mixed"} <= methods
+
+
+def test_limit_of_related_work(command, noisy, tmp_path):
+    """Of a denoiser that halves the colour the risk is (x/2)², of the render its variance."""
+    (tmp_path / "half.py").write_text("def half(x):\n    return x / 2\n")
+    methods = [{"image": "render"}, {"denoiser": "half.py:half", "image": "denoised"}]
+    (tmp_path / "two.yaml").write_text(json.dumps({"list": methods}))
+    words = ("--sweep", tmp_path / "two.yaml", "--data", noisy)
+    printed = command(related_work_limit, *words)
+    expected = {"render": [], "half": []}
+    for spp in (512, 4096):
+        frames = [pd.read_exr(noisy / f"{scene}_{spp:06}spp.exr") for scene in SCENES]
+        squares = {"render": [f.variance for f in frames], "half": [f.color**2 / 4 for f in frames]}
+        for method, images in squares.items():
+            expected[method].append(np.mean([np.sqrt(np.mean(i)) for i in images]))
+    (render,) = cells(printed, "render")
+    (half,) = cells(printed, f"{tmp_path / 'half.py'}:half")
+    np.testing.assert_allclose([float(c) for c in render[2:4]], expected["render"], rtol=1e-3)
+    np.testing.assert_allclose([float(c) for c in half[2:4]], expected["half"], rtol=1e-3)
+    assert (render[4], half[4]) == ("0", str(len(SCENES)))
+    assert float(half[1]) > 0
 
 
 def test_fig2(command, noisy, tmp_path):

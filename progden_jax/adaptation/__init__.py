@@ -5,7 +5,7 @@ Two ways: `post_correct` trains a small network behind the denoiser on two halve
 estimate. What comes out of either can be given to `progden_jax.progressive_denoise`.
 """
 
-from progden_jax.adaptation._halves import Halves, WithHalves, halves, split
+from progden_jax.adaptation._halves import Halves, WithHalves, halves, paired, split
 from progden_jax.adaptation.by_halves import Corrected, post_correct
 from progden_jax.adaptation.by_sure import Adaptation, Adapted, adapt, adapt_mixer
 from progden_jax.adaptation.correction import SETTINGS, PostCorrected, PostCorrection
@@ -22,6 +22,7 @@ __all__ = [
     "adapt",
     "adapt_mixer",
     "halves",
+    "paired",
     "post_correct",
     "split",
 ]

@@ -11,8 +11,7 @@ from progden_jax._numeric import safe_sqrt
 from progden_jax.denoisers._base import Bound
 from progden_jax.divergence import _random
 from progden_jax.frame import Frame, repaired, share
-
-_DIFFERING = ("color", "albedo", "normal", "depth")
+from progden_jax.subaverages import SubAverages, averaged
 
 
 class Halves(NamedTuple):
@@ -44,25 +43,25 @@ def halves(a: Frame, b: Frame) -> Halves:
     ValueError
         If a frame is no single image, or the sizes or samples per pixel differ.
     """
-    for name, color in (("a.color", a.color), ("b.color", b.color)):
-        _checks.image(name, color)
-    _checks.same_shape("b.color", b.color, "a.color", a.color)
-    if a.spp is not None and b.spp is not None and a.spp != b.spp:
+    return paired(averaged((a, b), names=("a", "b")))
+
+
+def paired(found: SubAverages) -> Halves:
+    """Two sub-averages as halves.
+
+    Raises
+    ------
+    ValueError
+        If they are not two, or their shares differ.
+    """
+    if len(found.shares) != 2:
+        raise ValueError(f"there are {len(found.shares)} sub-averages, expected two halves.")
+    if found.shares[0] != found.shares[1]:
+        first, second = (f"{float(found.frame.spp * share):g}" for share in found.shares)
         raise ValueError(
-            f"the halves have {float(a.spp):g} and {float(b.spp):g} samples per pixel, expected equal ones."
+            f"the halves have {first} and {second} samples per pixel, expected equal ones."
         )
-    a, b = repaired(a), repaired(b)
-    mean, difference = {}, {}
-    for name in _DIFFERING:
-        first, second = getattr(a, name), getattr(b, name)
-        if first is not None and second is not None:
-            mean[name], difference[name] = (first + second) / 2, (first - second) / 2
-    if a.variance is not None and b.variance is not None:
-        mean["variance"] = (a.variance + b.variance) / 4
-    else:
-        mean["variance"] = difference["color"] ** 2
-    spp = None if a.spp is None or b.spp is None else a.spp + b.spp
-    return Halves(Frame(**mean, spp=spp), difference)
+    return Halves(found.frame, {name: d[0] for name, d in found.differences.items()})
 
 
 def split(frame: Frame, key: jax.Array) -> Halves:

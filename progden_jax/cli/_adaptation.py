@@ -14,12 +14,12 @@ from progden_jax.cli._run import Failure, UsageError
 if TYPE_CHECKING:
     import jax
 
-    from progden_jax.adaptation import Halves
     from progden_jax.adaptation.correction import Params
     from progden_jax.cli._job import Outcome, Progress
     from progden_jax.denoisers import Denoiser
     from progden_jax.exr import Settings
     from progden_jax.frame import Frame
+    from progden_jax.subaverages import SubAverages
 
 NFOR = "nfor"
 
@@ -46,9 +46,10 @@ class AdaptOptions:
         tuple[Path, ...] | None,
         Parameter(
             consume_multiple=True,
-            help="Two independent renders of half the samples, for --post-correct and --denoiser nfor. IN is "
-            "their mean, or one of them: then their mean is denoised. For several inputs, folders that hold "
-            "files of the same names [default: IN, split by its variance].",
+            help="Two independent renders of half the samples, for --post-correct and --denoiser nfor; for a "
+            "--combiner of sub-averages as many as it takes. IN is their mean, or one of them: then their "
+            "mean is denoised. For several inputs, folders that hold files of the same names [default: IN, "
+            "split by its variance].",
         ),
     ] = None
     adapt_steps: Annotated[
@@ -85,8 +86,7 @@ class AdaptOptions:
             raise UsageError(f"--adapt-steps is {self.adapt_steps}, expected at least 1.")
         if self.sequence and not self.post_correct:
             raise UsageError("--sequence is for --post-correct, which hands its weights on.")
-        if self.halves is not None:
-            self._check_halves(read, network)
+        self._check_halves(read, network)
         if cost.max_memory is not None and (self.fits or self.halves):
             raise UsageError(
                 "--max-memory cuts images into parts, and --adapt, --post-correct and --halves need them "
@@ -94,23 +94,43 @@ class AdaptOptions:
             )
 
     def _check_halves(self, read: ReadOptions, network: NetworkOptions) -> None:
-        if len(self.halves or ()) != 2:
+        named = self.halves or ()
+        count, expected = len(named), max(network.sub_averages, 2)
+        if network.sub_averages > 1:
+            if self.fits:
+                raise UsageError(
+                    f"--combiner {network.combiner} combines sub-averages, and --adapt and --post-correct "
+                    "fit to one image: leave one out."
+                )
+            if self.halves is None:
+                raise UsageError(
+                    f"--combiner {network.combiner} combines {expected} sub-averages of the samples: name as "
+                    "many renders with --halves."
+                )
+        if self.halves is None:
+            return
+        if count != expected:
             raise UsageError(
-                f"--halves names {len(self.halves or ())} renders, expected two, after IN and before other "
-                "flags."
+                f"--halves names {count} renders, expected {expected}, after IN and before other flags."
             )
+        if len({path.resolve() for path in named}) < count:
+            raise UsageError("--halves names one render twice, expected independent ones.")
+        if network.sub_averages == 1:
+            self._check_takers(network)
+        if read.variance_from:
+            raise UsageError(
+                "--halves and --variance-from both name other renders, and both give a variance: give one."
+            )
+
+    def _check_takers(self, network: NetworkOptions) -> None:
         if not self.post_correct and network.denoiser != NFOR:
             raise UsageError(
-                "--halves are for --post-correct and --denoiser nfor; for the variance alone give "
-                "--variance-from."
+                "--halves are for --post-correct, --denoiser nfor and combiners of sub-averages; for the "
+                "variance alone give --variance-from."
             )
         if network.combiner and not self.post_correct:
             raise UsageError(
                 "--halves go to --denoiser nfor itself, and --combiner puts another behind it: leave one out."
-            )
-        if read.variance_from:
-            raise UsageError(
-                "--halves and --variance-from both name other renders, and both give a variance: give one."
             )
 
 
@@ -121,51 +141,51 @@ class Handed:
         self.params: Params | None = None
 
 
-def read_halves(item: Item, frame: "Frame", read: "Settings", outcome: "Outcome") -> "Halves":
-    """The two renders of which the item's frame is the mean, or of which it is one; bad pixels stay.
+def read_parts(item: Item, frame: "Frame", read: "Settings", outcome: "Outcome") -> "SubAverages":
+    """The renders of which the item's frame is the mean, or of which it is one; bad pixels stay.
 
     Raises
     ------
     Failure
         If it is neither.
     ValueError
-        If a file cannot be read, or sizes or samples per pixel differ.
+        If a file cannot be read, or sizes differ.
     """
     import numpy as np
 
-    from progden_jax import adaptation
     from progden_jax.exr import read_exr
-    from progden_jax.exr._statistics import are_halves
+    from progden_jax.exr._statistics import are_halves, uncertainty
+    from progden_jax.subaverages import averaged
 
-    is_half = any(item.input.samefile(other) for other in item.halves if other.exists())
+    count = len(item.halves)
+    is_part = any(item.input.samefile(other) for other in item.halves if other.exists())
     spp = read.get("spp")
-    if spp is not None and not is_half:
-        spp /= 2
-    a, b = (read_exr(other, **{**read, "spp": spp}) for other in item.halves)
-    found = adaptation.halves(a, b)
-    if (a.variance is None or b.variance is None) and (is_half or frame.variance is None):
-        outcome.variance = "two halves"
-        outcome.warnings.append(
-            "a variance from 2 renders is itself off by about 141 % at every pixel"
-        )
-    if is_half:
+    if spp is not None and not is_part:
+        spp /= count
+    parts = [read_exr(other, **{**read, "spp": spp}) for other in item.halves]
+    found = averaged(parts, names=[str(other) for other in item.halves])
+    colors, shares = [np.asarray(part.color) for part in parts], np.asarray(found.shares)
+    if any(part.variance is None for part in parts) and (is_part or frame.variance is None):
+        outcome.variance = f"{count} sub-averages"
+        outcome.warnings += uncertainty(count)
+    if is_part:
         outcome.spp = None if found.frame.spp is None else float(found.frame.spp)
-        return found._replace(frame=found.frame.replace(color=(a.color + b.color) / 2))
-    colors = [np.asarray(half.color) for half in (frame, a, b)]
-    if frame.size != a.size or not are_halves(colors[0], colors[1:]):
+        mean = np.tensordot(shares, np.stack(colors), 1)
+        return found._replace(frame=found.frame.replace(color=mean))
+    if frame.size != found.frame.size or not are_halves(np.asarray(frame.color), colors, shares):
         raise Failure(
             f"{item.input}: --halves {' '.join(map(str, item.halves))}: the input is neither their mean nor "
-            "one of them; give two renders of half its samples each."
+            f"one of them; give {count} renders that share its samples."
         )
     variance = found.frame.variance if frame.variance is None else frame.variance
-    kept = {name: d for name, d in found.difference.items() if getattr(frame, name) is not None}
-    return adaptation.Halves(frame.replace(variance=variance), kept)
+    kept = {name: d for name, d in found.differences.items() if getattr(frame, name) is not None}
+    return found._replace(frame=frame.replace(variance=variance), differences=kept)
 
 
 def adapted(
     frame: "Frame",
     denoiser: "Denoiser",
-    halves: "Halves | None",
+    parts: "SubAverages | None",
     options: AdaptOptions,
     key: "jax.Array",
     handed: Handed,
@@ -176,6 +196,7 @@ def adapted(
     import jax
 
     from progden_jax import adaptation
+    from progden_jax.combiner import BufferedCombiner, DeepCombiner
     from progden_jax.frame import repaired
 
     start = time.perf_counter()
@@ -198,12 +219,13 @@ def adapted(
         denoiser = found.adapted
     elif options.post_correct:
         split_key, fit_key = jax.random.split(key)
-        if halves is None:
+        if parts is None:
             both = adaptation.split(frame, split_key)
         else:
+            both = adaptation.paired(parts)
             # A buffer that was prefiltered has no noise left to differ by.
-            same = (n for n in halves.difference if getattr(frame, n) is getattr(halves.frame, n))
-            both = adaptation.Halves(repaired(frame), {n: halves.difference[n] for n in same})
+            same = (n for n in both.difference if getattr(frame, n) is getattr(parts.frame, n))
+            both = adaptation.Halves(repaired(frame), {n: both.difference[n] for n in same})
         corrected = adaptation.post_correct(
             both,
             denoiser,
@@ -215,16 +237,18 @@ def adapted(
         outcome.adaptation = {
             "kind": "post-correct",
             "steps": len(corrected.losses),
-            "halves": "split by the variance" if halves is None else "given",
+            "halves": "split by the variance" if parts is None else "given",
             "reused": handed.params is not None,
         }
         if options.sequence:
             handed.params = corrected.denoiser.params
         denoiser = corrected.denoiser
-    elif halves is not None:
-        return adaptation.WithHalves(denoiser, halves.difference["color"])
-    else:
+    elif parts is None:
         return denoiser
+    elif isinstance(denoiser, DeepCombiner):
+        return BufferedCombiner.of(denoiser, parts)
+    else:
+        return adaptation.WithHalves(denoiser, adaptation.paired(parts).difference["color"])
     outcome.adaptation["seconds"] = round(time.perf_counter() - start, 3)
     return denoiser
 

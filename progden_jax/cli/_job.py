@@ -13,7 +13,7 @@ import numpy as np
 import progden_jax as pd
 from progden_jax import memory, mixers
 from progden_jax.batch import Once, Size, canvas_of, shared_canvases
-from progden_jax.cli._adaptation import AdaptOptions, Handed, adapted, described, read_halves
+from progden_jax.cli._adaptation import AdaptOptions, Handed, adapted, described, read_parts
 from progden_jax.cli._compare import Scores, compare
 from progden_jax.cli._options import (
     SAVE_ALWAYS,
@@ -139,10 +139,10 @@ def process(item: Item, settings: Settings, outcome: Outcome, progress: Progress
     outcome.spp, outcome.variance = info.spp, info.variance
     outcome.warnings += info.warnings
     outcome.notes += info.notes
-    halves = None
+    parts = None
     if item.halves:
-        halves = read_halves(item, frame, read, outcome)
-        frame = halves.frame
+        parts = read_parts(item, frame, read, outcome)
+        frame = parts.frame
     reference = None if item.reference is None else _reference(item, frame, outcome)
     frame = _with_usable_variance(frame, info, outcome)
     frame, denoiser = settings.network.load(frame)
@@ -151,7 +151,7 @@ def process(item: Item, settings: Settings, outcome: Outcome, progress: Progress
     # Other numbers than the probes of the divergence.
     key = jax.random.fold_in(jax.random.key(settings.estimate.seed), 1)
     denoiser = adapted(
-        frame, denoiser, halves, settings.adaptation, key, settings.handed, outcome, progress
+        frame, denoiser, parts, settings.adaptation, key, settings.handed, outcome, progress
     )
     images, checkpoint = _denoise(item, frame, denoiser, settings, outcome, progress)
     if reference is not None:

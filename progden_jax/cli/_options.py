@@ -132,7 +132,8 @@ class NetworkOptions:
         str | None,
         Parameter(
             help="Weights of a deep combiner, which combines the denoised image with the render: the name of "
-            "a denoiser that some are shipped for, or a .safetensors file."
+            "a denoiser that some are shipped for, or a .safetensors file. Those for sub-averages of the "
+            "samples take --halves."
         ),
     ] = None
     quality: Annotated[
@@ -198,6 +199,13 @@ class NetworkOptions:
         exposed = not name or name.endswith(".tza") or name in denoisers.oidn.NAMES
         if self.exposure_value() is not None and not exposed:
             raise UsageError(f"--exposure is for OIDN's networks, and --denoiser names {name}.")
+
+    @property
+    def sub_averages(self) -> int:
+        """How many of a render the combiner takes; 1 without one."""
+        from progden_jax import combiner
+
+        return 1 if self.combiner is None else combiner.read(self.combiner).network.buffers
 
     def exposure_value(self) -> float | None:
         """The exposure as the library takes it."""

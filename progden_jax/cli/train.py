@@ -21,6 +21,7 @@ HELP = """Train a mixing network, a denoiser or a combiner on renders with refer
 progden train mixer --config cpu --data renders/ --output runs/hdr
 progden train denoiser --config cpu --set inputs=['albedo','normal'] --data renders/ -o runs/unet
 progden train combiner --config cpu --set denoiser=nfor --data renders/ -o runs/combiner
+progden train combiner --config cpu --set buffers=2 --data renders/ -o runs/halves
 progden train mixer --config mine.toml --set denoiser=oidn-hdr-alb-nrm -o runs/aux
 tensorboard --logdir runs
 ```
@@ -40,7 +41,9 @@ The same command goes on where it was killed, and comes to the same weights.
 _COMBINER_HELP = """Train a deep combiner for one denoiser; the best so far are OUTPUT/weights.safetensors.
 
 The same command goes on where it was killed, and comes to the same weights. Give them to
-`progden denoise --combiner`. Denoised images are kept in a cache folder between runs.
+`progden denoise --combiner`. Denoised images are kept in a cache folder between runs. With --set buffers=2
+it combines two sub-averages of the samples, made of each render and an earlier one of its nested series, as
+`progden render` makes them; 8,16,32 samples have exact halves.
 """
 
 _CONFIG = Parameter(

@@ -135,14 +135,20 @@ def _run(f: BoundCombiner, x: Array) -> Array:
     return y if inside is None else jnp.where(inside, y, 0)
 
 
-def applied(f: Any, noisy: Array, denoised: Array, inside: Array | None = None) -> Array:
+def applied(
+    f: Any,
+    noisy: Array,
+    denoised: Array,
+    inside: Array | None = None,
+    shares: Array | None = None,
+) -> Array:
     """The network on (B, H, W, 3) sub-averages."""
     buffers = {role: buffer[None] for role, buffer in f.buffers.items()}
+    images = noisy[:, None], denoised[:, None]
+    further = {"inside": inside, "shares": None if shares is None else shares[:, None]}
     # GPUs would else take TF32.
     with jax.default_matmul_precision("highest"):
-        return f.network.apply(f.params, noisy[:, None], denoised[:, None], buffers, inside=inside)[
-            0
-        ]
+        return f.network.apply(f.params, *images, buffers, **further)[0]
 
 
 def bound(denoiser: Denoiser, frame: Frame, valid: Valid, exposure: Any) -> Bound:

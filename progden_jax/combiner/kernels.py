@@ -6,6 +6,7 @@ every pixel i around it. Their weighted mean is z_c plus the weighted mean of th
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +31,7 @@ def combine(
     window: int,
     reliability: Float[Array, "b n h w 1"] | None = None,
     trust: Float[Array, "n h w 1"] | None = None,
+    shares: Float[Array, "b n"] | None = None,
     inside: Bool[Array, "h w 1"] | None = None,
 ) -> Float[Array, "n h w 3"]:
     """β = Σ_b Σ_i w_ib (y_ib + z_cb − z_ib) / Σ_b Σ_i w_ib over the window inside the image.
@@ -44,6 +46,8 @@ def combine(
     window : odd width in pixels.
     reliability : of every y_ib, > 0, by which its weight is multiplied in all windows; None: 1.
     trust : weight ≥ 0 of the mean of z_c itself, as one more estimate of its pixel; None: 0.
+    shares : of the samples, by which each sub-average counts: its weights are those of every one of them;
+        None: equal.
     inside : False where the images are padding.
 
     Raises
@@ -54,8 +58,9 @@ def combine(
     Notes
     -----
     Back et al. 2020, "Deep Combiner for Independent and Correlated Pixel Estimates", Eq. 14, and Eqs. 4 and
-    8 with one buffer; reliability and trust are not in it. Of B·window² weights per pixel `window` exist at a
-    time where images are large.
+    8 with one buffer; reliability, trust and shares are not in it. With a buffer for each sample, equal
+    weights within a sub-average make Eq. 14 this kernel of sub-averages weighted by their samples. Of
+    B·window² weights per pixel `window` exist at a time where images are large.
     """
     _checks.images("noisy", noisy)
     _checks.same_shape("denoised", denoised, "noisy", noisy)
@@ -63,6 +68,8 @@ def combine(
     residual = noisy - denoised
     counted = jnp.ones_like(residual[..., :1])
     both = jnp.concatenate([residual, counted], axis=-1)
+    counts = counts_of(shares)
+    both = both * counts
     if reliability is not None:
         both = both * reliability
     if inside is not None:
@@ -82,8 +89,13 @@ def combine(
     weights = sums[:, 3, ..., None]
     filtered = jnp.moveaxis(sums[:, :3], 1, -1)
     # Around the mean, for buffers that are equal must come out exactly as they are.
-    middle = denoised.mean(0)
+    middle = (counts * denoised).mean(0)
     shifted = weights * (denoised - middle) + filtered
     total = weights.sum(0) if trust is None else weights.sum(0) + trust
     total = jnp.maximum(total, jnp.finfo(weights.dtype).tiny)
     return middle + shifted.sum(0) / total
+
+
+def counts_of(shares: Float[Array, "b n"] | None) -> Any:
+    """The shares over their mean, to be multiplied with sub-averages; 1 where they are equal."""
+    return 1 if shares is None else (shares / shares.mean(0))[..., None, None, None]

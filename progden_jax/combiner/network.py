@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from progden_jax._convolution import same_convolution
 from progden_jax._neighbourhood import some_outputs
 from progden_jax._numeric import safe_sqrt
 from progden_jax._windows import box_sum
-from progden_jax.combiner.kernels import combine
+from progden_jax.combiner.kernels import combine, counts_of
 from progden_jax.denoisers._network import lit
 from progden_jax.denoisers.nfor import log_depth
 from progden_jax.mixers.architectures import he_normal
@@ -131,6 +132,7 @@ class KernelNetwork:
         buffers: Mapping[str, Float[Array, "n h w c"]],
         *,
         inside: Bool[Array, "h w 1"] | None = None,
+        shares: Float[Array, "b n"] | None = None,
     ) -> Float[Array, "n h w 3"]:
         """The combination of n images' sub-averages and their denoised versions.
 
@@ -139,8 +141,9 @@ class KernelNetwork:
         noisy, denoised : see `combine`, as many sub-averages as `buffers`.
         buffers : those in `inputs`, by name; the variance is that of the samples' mean.
         inside : False where the images are padding.
+        shares : of the samples that the sub-averages have, see `combine`.
         """
-        h = self._seen(noisy, denoised, buffers, inside)
+        h = self._seen(noisy, denoised, buffers, inside, shares)
         for n in range(1, self.layers):
             layer = params[f"conv{n}"]
             h = jax.nn.relu(same_convolution(h, layer["kernel"]) + layer["bias"])
@@ -155,11 +158,12 @@ class KernelNetwork:
             # A softmax over the window, in one pass: bounded, its largest logit need not be known.
             return jnp.exp(jnp.clip(logits, -_MOST, _MOST))
 
-        further = {}
+        further: dict[str, Any] = {}
         if self.robust:
             *reliability, trust = positive(self.buffers * self.window**2, self.buffers + 1)
             further = {"reliability": jnp.stack(reliability)[..., None], "trust": trust[..., None]}
-        return combine(noisy, denoised, weigh, window=self.window, inside=inside, **further)
+        further |= {"inside": inside, "shares": shares}
+        return combine(noisy, denoised, weigh, window=self.window, **further)
 
     def _seen(
         self,
@@ -167,10 +171,12 @@ class KernelNetwork:
         denoised: Float[Array, "b n h w 3"],
         buffers: Mapping[str, Float[Array, "n h w c"]],
         inside: Bool[Array, "h w 1"] | None,
+        shares: Float[Array, "b n"] | None,
     ) -> Float[Array, "n h w c"]:
         """What the first layer sees: log(1 + y), log(1 + z) and y − z relative to z, compressed, of every
         sub-average, then the buffers; depth and noise are relative too, as relMSE is."""
         level = lit(denoised)
+        whole = (counts_of(shares) * level).mean(0)
         relative = (noisy - denoised) / (level + _EPSILON)
         parts = [*jnp.log1p(lit(noisy)), *jnp.log1p(level), *jnp.arcsinh(relative)]
         for role in self.inputs:
@@ -178,7 +184,7 @@ class KernelNetwork:
             if role == "depth":
                 buffer = _beside_neighbours(log_depth(buffer), self.window, inside)
             elif role == "variance":
-                buffer = jnp.log1p(safe_sqrt(buffer) / (level.mean(0) + _EPSILON))
+                buffer = jnp.log1p(safe_sqrt(buffer) / (whole + _EPSILON))
             parts.append(buffer)
         seen = jnp.concatenate(parts, axis=-1)
         return seen if inside is None else jnp.where(inside, seen, 0)

@@ -10,11 +10,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import progden_jax as pd
+from progden_jax.combiner import BufferedCombiner, DeepCombiner
 from progden_jax.denoisers import Denoiser, Network
 from progden_jax.evaluation import parts
 from progden_jax.evaluation.cost import Cost, metered
 from progden_jax.evaluation.risk import risk_of_held, risk_of_mix
 from progden_jax.evaluation.settings import Settings
+from progden_jax.subaverages import SubAverages
 from progden_jax.survey import frame_of
 from progden_jax.training.evaluation import oracle_alpha
 
@@ -46,13 +48,24 @@ class Shown(NamedTuple):
     cost: Cost = Cost()
 
 
-def estimate(frame: pd.Frame, settings: Settings, max_memory: int | None) -> Estimate:
-    """The denoised image as the settings say, the denoiser fitted to the frame first if they do."""
+def estimate(
+    frame: pd.Frame,
+    settings: Settings,
+    max_memory: int | None,
+    divided: SubAverages | None = None,
+) -> Estimate:
+    """The denoised image as the settings say, the denoiser fitted to the frame first if they do.
+
+    `divided` are the frame's sub-averages, for a combiner of such.
+    """
     denoiser = parts.denoiser_for(frame, settings)
     if isinstance(denoiser, Network) and settings.adaptation != "post-correct":
         taken = {n: getattr(frame, n) for n in ("color", "variance", *denoiser.inputs)}
         frame = frame_of({name: buffer for name, buffer in taken.items() if buffer is not None})
-    fitted, fitting = denoiser, Cost(0.0)
+    fitted: Any = denoiser
+    fitting = Cost(0.0)
+    if divided is not None:
+        fitted = BufferedCombiner.of(cast(DeepCombiner, denoiser), divided)
     if settings.fit() is not None:
         fitted, fitting = metered(lambda: parts.adapted(frame, denoiser, settings))
     made = functools.partial(Estimate, frame, denoiser, fitted)

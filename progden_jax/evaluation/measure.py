@@ -18,9 +18,11 @@ from progden_jax.evaluation.plan import Cell
 from progden_jax.evaluation.settings import Settings
 from progden_jax.exr import write_exr
 from progden_jax.frame import centre
+from progden_jax.subaverages import SubAverages
 from progden_jax.survey import frame_of, survey
 from progden_jax.training.config import Meaning
-from progden_jax.training.index import Item
+from progden_jax.training.data import sub_averages
+from progden_jax.training.index import Item, earlier
 
 
 class Job(NamedTuple):
@@ -73,11 +75,15 @@ def _estimates(cell: Cell) -> bool:
 
 
 class _Pair(NamedTuple):
-    """What is looked at of a render and its reference, repaired; `noise` is the reference's mean variance."""
+    """What is looked at of a render and its reference, repaired; `noise` is the reference's mean variance.
+
+    `divided` are the render's sub-averages, where there is use for them.
+    """
 
     frame: pd.Frame
     reference: Image
     noise: float
+    divided: SubAverages | None
 
 
 def measure(job: Job) -> list[Row]:
@@ -88,14 +94,18 @@ def measure(job: Job) -> list[Row]:
     ValueError
         If a file cannot be read, sizes differ, or the render lacks what a method takes.
     """
-    pair = _read(job.item, job.variance_of, job.crop)
-    made = None if job.shown is None else estimate(pair.frame, job.shown, job.max_memory)
+    count = 1 if job.shown is None else parts.sub_averages(job.shown)
+    pair = _read(job.item, job.variance_of, job.crop, count)
+    made = None
+    if job.shown is not None:
+        made = estimate(pair.frame, job.shown, job.max_memory, pair.divided)
     return [_row(cell, pair, made, job) for cell in job.cells]
 
 
-def _read(item: Item, variance_of: Meaning, crop: int) -> _Pair:
+def _read(item: Item, variance_of: Meaning, crop: int, count: int) -> _Pair:
     given = None if variance_of == "mean" else variance_of
-    frame = pd.read_exr(item.path, variance_of=given)
+    files = {item.spp: item.path, **earlier(item, count)}
+    frame, *before = (_sound(pd.read_exr(path, variance_of=given)) for path in files.values())
     reference = _reference(item.reference, given)
     if frame.size != reference.size:
         (height, width), (high, wide) = frame.size, reference.size
@@ -103,11 +113,15 @@ def _read(item: Item, variance_of: Meaning, crop: int) -> _Pair:
             f"{item.path} is {width}×{height} pixels but its reference {item.reference} is {wide}×{high}."
         )
     try:
-        frame, truth = ((centre(f, crop) if crop else f) for f in (_sound(frame), reference))
+        frame, truth, *before = (
+            centre(f, crop) if crop else f for f in (frame, reference, *before)
+        )
     except ValueError as error:
         raise ValueError(f"{item.path}: {error}") from None
     noise = 0.0 if truth.variance is None else mean_of(truth.variance)
-    return _Pair(frame, np.asarray(truth.color), noise)
+    series = dict(zip(files, (frame, *before), strict=True))
+    divided = sub_averages(item, series) if before else None
+    return _Pair(frame, np.asarray(truth.color), noise, divided)
 
 
 @functools.lru_cache(maxsize=2)

@@ -38,6 +38,19 @@ def _named(name: str, settings: Settings) -> Denoiser:
     return DeepCombiner(weights.params, passable(denoiser), weights.network)
 
 
+def sub_averages(settings: Settings) -> int:
+    """How many of a render the combiner takes; 1 without one."""
+    if settings.image == "render" or settings.combiner == NONE:
+        return 1
+    count = _read_combiner(settings.combiner).network.buffers
+    if count > 1 and settings.fit() is not None:
+        raise ValueError(
+            f"combiner is {settings.combiner}, which combines {count} sub-averages, and adaptation is "
+            f"{settings.adaptation!r}, which fits to one image: set one of them to none."
+        )
+    return count
+
+
 def adapted(frame: Frame, denoiser: Denoiser, settings: Settings) -> Denoiser:
     """The denoiser adapted to the render as the settings say, or as it is."""
     # Other numbers than the probes of the divergence.

@@ -15,7 +15,7 @@ from progden_jax.evaluation import settings as names
 from progden_jax.evaluation.settings import Settings
 from progden_jax.training import config
 from progden_jax.training.config import Meaning
-from progden_jax.training.index import Item, index
+from progden_jax.training.index import Item, earlier, index
 
 RESULTS = 1
 """Part of every key: raise it when the arithmetic behind a result changes."""
@@ -124,7 +124,9 @@ class Plan:
             if self.data.crop:
                 files.append(f"crop {self.data.crop}")
             for method in self.methods:
-                key = _hash([shared[method.label], item.scene, item.spp, *files])
+                own = earlier(item, parts.sub_averages(method.settings)).values()
+                read = [*files, *map(digest, own)]
+                key = _hash([shared[method.label], item.scene, item.spp, *read])
                 cells.append(Cell(key, item, method))
         return cells
 

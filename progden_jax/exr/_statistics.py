@@ -57,8 +57,23 @@ def from_renders(renders: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     return mean.astype(np.float32), variance.astype(np.float32)
 
 
-def are_halves(color: np.ndarray, renders: list[np.ndarray]) -> bool:
-    """Whether `color` is the mean of `renders` up to rounding, small beside how they differ."""
+def uncertainty(count: int) -> list[str]:
+    """Warnings of a variance from so few renders."""
+    if count >= 4:
+        return []
+    percent = 100 * (2 / (count - 1)) ** 0.5
+    return [
+        f"a variance from {count} renders is itself off by about {percent:.0f} % at every pixel"
+    ]
+
+
+def are_halves(
+    color: np.ndarray, renders: list[np.ndarray], shares: np.ndarray | None = None
+) -> bool:
+    """Whether `color` is the mean of `renders` up to rounding, small beside how they differ.
+
+    `shares` weigh the renders; None: equally.
+    """
     if len(renders) < 2:
         return False
     total = np.stack([r.astype(np.float64) for r in renders])
@@ -66,7 +81,7 @@ def are_halves(color: np.ndarray, renders: list[np.ndarray]) -> bool:
     total, color = total[:, finite], color[finite].astype(np.float64)
     # Magnitudes compressed, so that no firefly decides alone; both sides of the comparison are.
     scale = np.maximum(np.abs(total).max(0, initial=0), 1e-12)
-    mean = total.mean(0)
+    mean = np.average(total, axis=0, weights=shares)
     off = np.square((mean - color) / scale).sum()
     spread = np.square((total - mean) / scale).sum() / len(renders)
     return bool(off <= 0.01 * spread)

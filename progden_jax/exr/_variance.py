@@ -108,11 +108,7 @@ def _from_others(
         )
     mean, variance = _statistics.from_renders(everything)
     count = len(everything)
-    if count < 4:
-        percent = 100 * (2 / (count - 1)) ** 0.5
-        render.warnings.append(
-            f"a variance from {count} renders is itself off by about {percent:.0f} % at every pixel"
-        )
+    render.warnings += _statistics.uncertainty(count)
     if halves:
         return color, variance, f"{count} buffers of which the colour is the mean", render.spp
     spp = None if render.spp is None else render.spp * count

@@ -19,9 +19,14 @@ from progden_jax.training.mixer_task import check_exposure
 
 _METRICS = ("rmse", "smape", "relmse")
 
+_OF_PARTS = ("shares", "parts", "denoised_parts")
+
 
 class CombinerTask:
-    """A combiner for one denoiser, of one buffer; see `step.Task`.
+    """A combiner for one denoiser; see `step.Task`.
+
+    Of several buffers, the sub-averages of a render are what it and earlier renders of its nested series
+    hold beyond one another, chosen as equal in samples as can be and taken in random order.
 
     Parameters
     ----------
@@ -48,20 +53,19 @@ class CombinerTask:
     ) -> None:
         self.config = config
         try:
-            self.network = combiner.KernelNetwork(**config.options)
+            self.network = combiner.KernelNetwork(buffers=config.buffers, **config.options)
         except TypeError as error:
             raise ValueError(f"options is {dict(config.options)}: {error}") from None
-        if self.network.buffers != 1:
-            raise ValueError(
-                f"options has buffers = {self.network.buffers}, and the data are single renders without "
-                "sub-averages: leave it at 1."
-            )
         self.denoiser = denoisers.load(config.denoiser) if denoiser is None else denoiser
         check_exposure(config, self.denoiser)
         self.cache = EstimateCache(self.denoiser, None, cache_folder)
         auxiliary = [role for role in self.network.inputs if role != "variance"]
         examples, held = data.load_split(
-            config, cache=self.cache, auxiliary=auxiliary, progress=progress
+            config,
+            cache=self.cache,
+            auxiliary=auxiliary,
+            parts=config.buffers,
+            progress=progress,
         )
         self.size = examples.size
         self.items, self.arrays = examples
@@ -76,8 +80,16 @@ class CombinerTask:
     ) -> dict[str, Array]:
         """One augmented example."""
         change = augment.draw(key, self.size, self.config)
+        changed = functools.partial(augment.apply, change, crop=self.config.crop)
         picked = {name: array[index] for name, array in arrays.items()}
-        return augment.apply(change, picked, crop=self.config.crop)
+        if self.network.buffers == 1:
+            return changed(picked)
+        # A number of its own beside those that `draw` takes.
+        order = jax.random.permutation(jax.random.fold_in(key, 8), self.network.buffers)
+        shares, color, denoised = (picked.pop(name)[order] for name in _OF_PARTS)
+        parts = jax.vmap(changed)({"color": color, "denoised": denoised})
+        found = shares, parts["color"], parts["denoised"]
+        return {**changed(picked), **dict(zip(_OF_PARTS, found, strict=True))}
 
     def loss(
         self, params: Params, batch: Mapping[str, Float[Array, "b ..."]]
@@ -113,7 +125,10 @@ class CombinerTask:
 
 def _combined(network: combiner.KernelNetwork, params: Params, batch: Mapping[str, Array]) -> Array:
     buffers = {role: batch[role] for role in network.inputs}
-    return network.apply(params, batch["color"][None], batch["denoised"][None], buffers)
+    if network.buffers == 1:
+        return network.apply(params, batch["color"][None], batch["denoised"][None], buffers)
+    shares, noisy, denoised = (jnp.moveaxis(batch[name], 1, 0) for name in _OF_PARTS)
+    return network.apply(params, noisy, denoised, buffers, shares=shares)
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -118,12 +118,14 @@ class CombinerConfig(RunConfig):
     """How to train a deep combiner."""
 
     denoiser: str = "nfor"  # name or weights file of the denoiser whose images are combined
+    buffers: int = 1  # sub-averages that are combined; made of nested renders, see the guide
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # of its KernelNetwork
     loss: str = "relmse"  # as the paper; smape, relmse, l1, logl1, or log-relmse
     weights_dtype: str = "float32"  # of the weights file; float16 halves it, to three digits
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        _checks.positive_int("buffers", self.buffers)
         _checks.choice("loss", self.loss, (*SUPERVISED, LOG_RELMSE))
         _checks.choice("weights_dtype", self.weights_dtype, ("float32", "float16"))
 

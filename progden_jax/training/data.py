@@ -1,23 +1,29 @@
 """Renders, references and estimates as arrays in memory, one per buffer with the examples stacked."""
 
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 import progden_jax as pd
+from progden_jax import subaverages
 from progden_jax.frame import repaired
+from progden_jax.subaverages import SubAverages
 from progden_jax.training.config import Meaning, RunConfig
 from progden_jax.training.estimates import EstimateCache
-from progden_jax.training.index import Item, index, split
+from progden_jax.training.index import Item, earlier, index, split
 
 Progress = Callable[[int, int], None]
 """Called with how many of how many are done."""
 
 
 class Examples(NamedTuple):
-    """`arrays` are (N, H, W, C), but for mean_variance (N,) and divergence (N, draws, H, W, 3)."""
+    """`arrays` are (N, H, W, C), but for mean_variance (N,) and divergence (N, draws, H, W, 3).
+
+    Of B sub-averages, parts and denoised_parts are (N, B, H, W, 3) and shares (N, B).
+    """
 
     items: tuple[Item, ...]
     arrays: dict[str, np.ndarray]
@@ -35,6 +41,7 @@ def load(
     cache: EstimateCache | None = None,
     draws: int = 1,
     auxiliary: Sequence[str] = (),
+    parts: int = 1,
     progress: Progress = lambda done, total: None,
 ) -> Examples:
     """The examples, bad pixels repaired.
@@ -44,11 +51,12 @@ def load(
     cache : gives denoised images, and divergences if it has a method; None leaves them out.
     draws : divergences of so many seeds per render.
     auxiliary : buffers to take besides, of albedo, normal and depth.
+    parts : sub-averages of each render, from those of its scene with fewer samples.
 
     Raises
     ------
     ValueError
-        If sizes differ, or a render lacks a variance or a buffer asked for.
+        If sizes differ, a render lacks a variance or a buffer asked for, or its sub-averages cannot be had.
     """
     rows: dict[str, list] = {}
     references: dict[object, np.ndarray] = {}
@@ -84,6 +92,8 @@ def load(
                 row["divergence"] = np.stack(drawn)
             if found[0].probe is not None:
                 row["probe"], row["tangent"] = found[0].probe, found[0].tangent
+        if parts > 1:
+            row |= _parts(item, frame, parts, variance_of, cache)
         for name, value in row.items():
             rows.setdefault(name, []).append(np.asarray(value, np.float32))
     progress(len(items), len(items))
@@ -96,9 +106,12 @@ def load_split(
     cache: EstimateCache | None = None,
     draws: int = 1,
     auxiliary: Sequence[str] = (),
+    parts: int = 1,
     progress: Progress = lambda done, total: None,
 ) -> tuple[Examples, Examples]:
     """(to train on, held out) of the folders that the configuration names; see `load`.
+
+    Where it names no samples per pixel, the lowest of each scene that nothing divides are left out.
 
     Raises
     ------
@@ -112,6 +125,9 @@ def load_split(
                 "folder, or rename it if it is not."
             )
     items = index(config.data, spp=config.spp, reference_spp=config.reference_spp)
+    if not config.spp:
+        by_scene = itertools.groupby(items, key=lambda item: item.scene)
+        items = [item for _, own in by_scene for item in list(own)[parts - 1 :]]
     training, held = split(items, share=config.held_out, scenes=config.held_out_scenes)
     both = load(
         training + held,
@@ -119,6 +135,7 @@ def load_split(
         cache=cache,
         draws=draws,
         auxiliary=auxiliary,
+        parts=parts,
         progress=progress,
     )
     if config.crop > min(both.size):
@@ -142,6 +159,37 @@ def _repaired(item: Item, variance_of: Meaning, *, reference: bool = False) -> p
                 f"{item.path} has no variance, and training needs that of the sample mean."
             )
     return repaired(frame)
+
+
+def sub_averages(item: Item, series: Mapping[int, pd.Frame]) -> SubAverages:
+    """Of an item's render, from it and the `earlier` ones of its nested series by samples per pixel.
+
+    Raises
+    ------
+    ValueError
+        If it does not go on from them.
+    """
+    frames = [frame.replace(spp=spp) for spp, frame in sorted(series.items())]
+    try:
+        return subaverages.averaged(subaverages.nested(frames))
+    except ValueError as error:
+        raise ValueError(f"{item.path}: {error}") from None
+
+
+def _parts(
+    item: Item, frame: pd.Frame, count: int, variance_of: Meaning, cache: EstimateCache | None
+) -> dict[str, Any]:
+    """The render's sub-averages as arrays."""
+    series = {
+        spp: _repaired(item._replace(path=path), variance_of)
+        for spp, path in earlier(item, count).items()
+    }
+    found = sub_averages(item, {**series, item.spp: frame})
+    differences = found.differences["color"]
+    row: dict[str, Any] = {"parts": frame.color + differences, "shares": found.shares}
+    if cache is not None:
+        row["denoised_parts"] = cache.parts(frame, differences, found.shares)
+    return row
 
 
 def _size(size: Sequence[int]) -> str:

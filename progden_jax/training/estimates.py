@@ -5,6 +5,7 @@ They depend on render, denoiser, method and seed alone, and cost far more than a
 
 import functools
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ from safetensors.numpy import save
 from progden_jax._files import replacing
 from progden_jax._fingerprint import fingerprint
 from progden_jax._numeric import safe_sqrt
+from progden_jax.combiner.buffers import bound_parts
 from progden_jax.compilation import cache_folder
 from progden_jax.denoisers import Denoiser
 from progden_jax.divergence import Method
@@ -81,30 +83,65 @@ class EstimateCache:
 
     def get(self, frame: Frame, seed: int = 0) -> Estimate:
         """The estimate for a repaired frame; `seed` is of the random probes."""
-        path = self.folder / f"{self.key(frame, seed)}.safetensors"
-        found = self._read(path, frame.color.shape) if self.stores else None
+        key, tangents = jax.random.key(seed), len(self._fields) > 2
+
+        def make() -> tuple[Array, ...]:
+            return _estimate(frame, self._denoiser, key, method=self._method, tangents=tangents)
+
+        return Estimate(**self._kept(self.key(frame, seed), self._fields, frame.color.shape, make))
+
+    def parts(
+        self,
+        frame: Frame,
+        differences: Float[Array, "b h w 3"],
+        shares: Float[Array, " b"],
+    ) -> Float[np.ndarray, "b h w 3"]:
+        """The denoised sub-averages of a repaired frame, see `progden_jax.combiner.of_buffers`."""
+        key = fingerprint(self.key(frame, 0), differences, shares)
+
+        def make() -> tuple[Array]:
+            return (_denoised_parts(frame, self._denoiser, differences, shares),)
+
+        return self._kept(key, ("denoised",), differences.shape, make)["denoised"]
+
+    def _kept(
+        self,
+        key: str,
+        fields: tuple[str, ...],
+        shape: tuple[int, ...],
+        make: Callable[[], tuple[Array, ...]],
+    ) -> dict[str, np.ndarray]:
+        """From disk where it is there and whole, else made, and kept where the denoiser allows it."""
+        path = self.folder / f"{key}.safetensors"
+        found = _read(path, fields, shape) if self.stores else None
         if found is not None:
             self.hits += 1
             return found
         self.misses += 1
-        key, tangents = jax.random.key(seed), len(self._fields) > 2
-        made = _estimate(frame, self._denoiser, key, method=self._method, tangents=tangents)
-        arrays = {name: np.asarray(a) for name, a in zip(self._fields, made, strict=True)}
+        arrays = {name: np.asarray(a) for name, a in zip(fields, make(), strict=True)}
         if self.stores:
             self.folder.mkdir(parents=True, exist_ok=True)
             with replacing(path) as temporary:
                 temporary.write_bytes(save(arrays, {"digest": fingerprint(*arrays.values())}))
-        return Estimate(**arrays)
+        return arrays
 
-    def _read(self, path: Path, shape: tuple[int, ...]) -> Estimate | None:
-        try:
-            with safe_open(path, "numpy") as file:
-                digest = (file.metadata() or {})["digest"]
-                arrays = {name: file.get_tensor(name) for name in self._fields}
-        except (OSError, KeyError, SafetensorError):
-            return None
-        whole = all(a.shape == shape for a in arrays.values())
-        return Estimate(**arrays) if whole and fingerprint(*arrays.values()) == digest else None
+
+def _read(
+    path: Path, fields: tuple[str, ...], shape: tuple[int, ...]
+) -> dict[str, np.ndarray] | None:
+    try:
+        with safe_open(path, "numpy") as file:
+            digest = (file.metadata() or {})["digest"]
+            arrays = {name: file.get_tensor(name) for name in fields}
+    except (OSError, KeyError, SafetensorError):
+        return None
+    whole = all(a.shape == shape for a in arrays.values())
+    return arrays if whole and fingerprint(*arrays.values()) == digest else None
+
+
+@jax.jit
+def _denoised_parts(frame: Frame, denoiser: Denoiser, differences: Array, shares: Array) -> Array:
+    return bound_parts(denoiser, frame, differences, shares)(frame.color)
 
 
 @functools.partial(jax.jit, static_argnames=("method", "tangents"))

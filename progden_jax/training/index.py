@@ -7,6 +7,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from progden_jax import subaverages
+
 _NAME = re.compile(r"(?P<scene>.+)_(?P<spp>\d+)spp$")
 
 
@@ -73,6 +75,30 @@ def index(
             f"{listed}: no render{asked} named NAME_SSSSSSspp.exr with a reference{wanted} beside it."
         )
     return items
+
+
+def earlier(item: Item, parts: int) -> dict[int, Path]:
+    """The renders beside an item's, by samples per pixel, that divide its samples into so many parts.
+
+    The series must be nested: each render with the samples of the one before.
+
+    Raises
+    ------
+    ValueError
+        If there are too few.
+    """
+    if parts == 1:
+        return {}
+    scene = item.path.stem.rpartition("_")[0]
+    beside = {}
+    for path in item.path.parent.glob("*.exr"):
+        found = _NAME.fullmatch(path.stem)
+        if found and found["scene"] == scene and path != item.reference:
+            beside[int(found["spp"])] = path
+    try:
+        return {spp: beside[spp] for spp in subaverages.cuts(beside, item.spp, parts)}
+    except ValueError as error:
+        raise ValueError(f"{item.path}: {error}") from None
 
 
 def split(
