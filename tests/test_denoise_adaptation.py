@@ -55,8 +55,8 @@ def few_layers(monkeypatch):
 def denoise(network, capsys):
     """Run the command with that network; gives the status, what --json told, and stderr."""
 
-    def call(*words):
-        words = ["denoise", *words, "--denoiser", network, "--mixer", "closed-form", "--json"]
+    def call(*words, denoiser=network):
+        words = ["denoise", *words, "--denoiser", denoiser, "--mixer", "closed-form", "--json"]
         status = main([str(word) for word in words])
         out, err = capsys.readouterr()
         assert "Traceback" not in err
@@ -134,6 +134,20 @@ def test_the_input_may_be_one_of_the_halves(halves, few_layers, denoise):
     status, (told,), _ = denoise(halves / "other.exr", "-o", halves / "no.exr", *words, *pair)
     assert (status, "neither their mean nor one of them" in told["error"]) == (1, True)
     assert not (halves / "no.exr").exists()
+
+
+def test_nfor_filters_the_halves_by_each_other(halves, denoise, monkeypatch):
+    nfor = pd.denoisers.NFOR(radius=1, patch=1, bandwidths=(1.0,), inputs=())
+    monkeypatch.setattr(pd.denoisers, "NFOR", lambda **_: nfor)
+    out, pair = halves / "out.exr", [halves / f"{name}.exr" for name in "ab"]
+    words = ["--save", "denoised", "--halves", *pair]
+    status, (told,), err = denoise(halves / "whole.exr", "-o", out, *words, denoiser="nfor")
+    assert (status, err) == (0, "")
+    assert (told["denoiser"], told["adaptation"]) == ("nfor", None)
+    frame = read_exr(halves / "whole.exr")
+    f = nfor.bind(frame, halves=tuple(read_exr(half).color for half in pair))
+    written = pd.exr.read_layers(out)["denoised"]
+    np.testing.assert_allclose(written, f(frame.color), atol=1e-5)
 
 
 def test_an_interrupt_leaves_nothing(halves, denoise, monkeypatch):
