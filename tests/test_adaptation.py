@@ -318,6 +318,31 @@ def test_post_correction_goes_on_from_weights_and_follows_its_key(corrected):
         adaptation.post_correct(halves, bright, start=first.denoiser.params)
 
 
+@pytest.mark.parametrize(("unit", "fireflies"), [(1e-3, ()), (1e2, ((3, 4), (15, 20)))])
+def test_post_correction_learns_in_any_unit_and_beside_fireflies(corrected, unit, fireflies):
+    """By its own rate: neither so low that nothing is learned, nor so high that the network dies."""
+    halves, bright, settings, _, truth = corrected
+    color, variance = (np.array(a) for a in (halves.frame.color, halves.frame.variance))
+    calm = np.ones(halves.frame.size, bool)
+    for row, column in fireflies:
+        color[row, column], variance[row, column] = 300, 300**2
+        calm[row - 2 : row + 3, column - 2 : column + 3] = False
+    frame = halves.frame.replace(color=unit * color, variance=unit**2 * variance)
+    scaled = dataclasses.replace(bright, rest=unit * bright.rest)
+    found = adaptation.post_correct(
+        adaptation.split(frame, jax.random.key(5)),
+        scaled,
+        correction=dataclasses.replace(settings, rate=None, steps=120),
+    )
+    before, after = (
+        ((np.asarray(i) / unit - truth)[calm] ** 2).mean() for i in (scaled(frame), found.image)
+    )
+    assert after < 0.2 * before
+    # 0.01 times the noise over the mean, at which log(1 + ·) has half of it. The fireflies' own RMS is 17.
+    usual = 0.01 * 0.1 / np.asarray(halves.frame.color).mean() / 2
+    assert 0.9 * usual < found.rate < (3 if fireflies else 1.1) * usual
+
+
 def test_patches_cover_the_image():
     from progden_jax.adaptation.by_halves import _corners
 

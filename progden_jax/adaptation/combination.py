@@ -32,8 +32,18 @@ Weigh = Callable[[Array, Float[Array, "5 h w"]], Float[Array, "h w"]]
 """From an offset's number in raster order and the squared distances of the guides there to its weight."""
 
 
-def guides_of(frame: Frame, denoised: Float[Array, "h w 3"]) -> Float[Array, "h w 13"]:
+def level_of(frame: Frame) -> Float[Array, ""]:
+    """The mean radiance of a frame, 1 if there is none: bandwidths and rates of learning suit a mean of 1."""
+    mean = jnp.maximum(frame.color, 0).mean()
+    return jnp.where(mean > 0, mean, 1)
+
+
+def guides_of(
+    frame: Frame, denoised: Float[Array, "h w 3"], level: Float[Array, ""] | float = 1.0
+) -> Float[Array, "h w 13"]:
     """The guides of a frame; a buffer that it lacks is 0, depth is in units of its mean.
+
+    Radiance is in units of `level`, see `level_of`.
 
     Raises
     ------
@@ -47,8 +57,8 @@ def guides_of(frame: Frame, denoised: Float[Array, "h w 3"]) -> Float[Array, "h 
         mean = jnp.abs(depth).mean()
         depth = jnp.where(mean > 0, depth / jnp.where(mean > 0, mean, 1), 0)
     found = {
-        "noisy": frame.color,
-        "denoised": denoised,
+        "noisy": frame.color / level,
+        "denoised": denoised / level,
         "albedo": frame.albedo,
         "normal": frame.normal,
         "depth": depth,

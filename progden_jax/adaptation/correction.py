@@ -29,7 +29,10 @@ _MIN_STEPS = 80
 
 @dataclasses.dataclass(frozen=True)
 class PostCorrection:
-    """What is fitted, and how; the defaults are the paper's (section 4.2).
+    """What is fitted, and how; the defaults are the paper's (section 4.2), but for `rate`.
+
+    Radiance is in units of the render's mean, see `combination.level_of`: the paper's bandwidths and rates
+    suit renders of about that brightness, and in dark ones its network learns nothing.
 
     Parameters
     ----------
@@ -40,7 +43,8 @@ class PostCorrection:
     epochs : passes over the image's patches.
     patch, batch : width of the patches in pixels, at most the image's, and how many make a step.
     steps : instead of epochs; None: those that the epochs have, but at least 80.
-    rate : learning rate of Adam; None: 0.01 times the render's RMS noise by its halves, at most 0.01.
+    rate : learning rate of Adam; None: 0.01 times the RMS noise of log(1 + radiance), by the halves. The
+        paper's is that of radiance itself, so that fireflies and bright renders raise it until the network dies.
     """
 
     refined: bool = True
@@ -87,7 +91,7 @@ class PostCorrection:
         return params
 
     def apply(self, params: Params, guides: Float[Array, "h w 13"]) -> Float[Array, "h w 3"]:
-        """The corrected image of a noisy and a denoised one, see `combination.guides_of`."""
+        """The corrected image of a noisy and a denoised one, see `combination.guides_of`, in their units."""
         last = params[f"conv{self.layers}"]
         radiance = jnp.log1p(jnp.maximum(guides[..., :6], 0))
         h = jnp.concatenate([radiance, guides[..., 6:]], axis=-1)
@@ -152,13 +156,13 @@ class PostCorrected(Around):
     def bind(self, frame: Frame) -> Bound:
         """f with y = f(x); `frame` must be of the size of the one that it was fitted to."""
         bound = [(half, self.denoiser.bind(half)) for half in separate(frame, self.difference)]
-        shift = self.difference["color"]
+        shift, level = self.difference["color"], combination.level_of(frame)
 
         def f(x: Array) -> Array:
             parts = []
             for (half, inner), color in zip(bound, (x + shift, x - shift), strict=True):
-                guides = combination.guides_of(half.replace(color=color), inner(color))
+                guides = combination.guides_of(half.replace(color=color), inner(color), level)
                 parts.append(self.correction.apply(self.params, guides))
-            return (parts[0] + parts[1]) / 2
+            return level * (parts[0] + parts[1]) / 2
 
         return f
