@@ -43,8 +43,8 @@ class PostCorrection:
     epochs : passes over the image's patches.
     patch, batch : width of the patches in pixels, at most the image's, and how many make a step.
     steps : instead of epochs; None: those that the epochs have, but at least 80.
-    rate : learning rate of Adam; None: 0.01 times the RMS noise of log(1 + radiance), by the halves. The
-        paper's is that of radiance itself, so that fireflies and bright renders raise it until the network dies.
+    rate : learning rate of Adam; None: 0.01 times the RMS noise of log(1 + radiance), by the halves. By the
+        paper it is that of radiance, which fireflies and bright renders raise until the network dies.
     """
 
     refined: bool = True
