@@ -220,9 +220,9 @@ def test_weights_that_vanish_have_derivatives(guides):
 
 def test_one_pixel_is_its_own_mean():
     frame = pd.Frame(np.full((1, 1, 3), 2.0, np.float32), np.ones((1, 1, 3), np.float32))
-    seen = combination.guides_of(frame, frame.color)
+    seen = combination.guides_of(frame, frame.color, combination.units_of(frame))
     params = drawn(jax.eval_shape(SMALL.init, jax.random.key(0)))
-    np.testing.assert_allclose(jax.jit(SMALL.apply)(params, seen), frame.color, rtol=1e-6)
+    np.testing.assert_allclose(jax.jit(SMALL.apply)(params, seen), 1, rtol=1e-6)
 
 
 def test_the_networks_are_those_of_table_1():
@@ -399,6 +399,30 @@ def test_only_some_weights(adapted):
     assert found.adapted.rest != dim.rest
     with pytest.raises(ValueError, match="only names conv9, expected some of gain, rest"):
         adaptation.adapt(frame, dim, adaptation=dataclasses.replace(some, only=("conv9",)))
+
+
+def test_a_correction_is_fitted_by_sure(corrected):
+    """To one image, no halves; where a step makes nothing better, the denoiser stays as it is."""
+    halves, bright, _, _, truth = corrected
+    settings = dataclasses.replace(SURE, steps=60, rate=None, every=20)
+    frame = halves.frame
+    found = adaptation.correct_by_sure(frame, bright, correction=SMALL, adaptation=settings)
+    assert isinstance(found.adapted, adaptation.PostCorrected)
+    before, after = (((np.asarray(f(frame)) - truth) ** 2).mean() for f in (bright, found.adapted))
+    assert after < 0.1 * before
+    assert found.after < found.before
+    hardly = dataclasses.replace(settings, steps=1, confidence=1e3)
+    same = adaptation.correct_by_sure(frame, bright, correction=SMALL, adaptation=hardly)
+    assert same.step == 0
+    assert jax.tree.leaves(same.adapted) == jax.tree.leaves(bright)
+    settings = dataclasses.replace(settings, steps=1)
+    again = adaptation.correct_by_sure(
+        frame, bright, correction=SMALL, adaptation=settings, start=found.adapted.params
+    )
+    assert again.step == 1
+    assert abs(again.risks[-1] - found.risks.min()) < 0.1 * found.risks[0]
+    with pytest.raises(ValueError, match="other shapes"):
+        adaptation.correct_by_sure(frame, bright, start=found.adapted.params)
 
 
 @jax.tree_util.register_dataclass

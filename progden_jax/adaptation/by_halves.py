@@ -73,7 +73,7 @@ def post_correct(
     correction = PostCorrection() if correction is None else correction
     key = jax.random.key(0) if key is None else key
     weights_key, order_key = jax.random.split(key)
-    params = _init(correction, weights_key) if start is None else _checked(correction, start)
+    params = _init(correction, weights_key) if start is None else correction.checked(start)
     data = _examples(passable(denoiser), halves)
     size = halves.frame.size
     corners = _corners(size, correction.patch)
@@ -102,16 +102,6 @@ def post_correct(
 _init = jax.jit(PostCorrection.init, static_argnums=0)
 
 
-def _checked(correction: PostCorrection, params: Params) -> Params:
-    expected = jax.eval_shape(correction.init, jax.random.key(0))
-    if jax.tree.map(jnp.shape, params) != jax.tree.map(jnp.shape, expected):
-        raise ValueError(
-            "start holds weights of other shapes than the correction's: give those of a correction with the "
-            "same window, layers, width and setting."
-        )
-    return params
-
-
 def _corners(size: tuple[int, int], patch: int) -> np.ndarray:
     """Rows and columns where patches begin that cover the image, the last ones moved inside."""
     starts = [[min(s, max(n - patch, 0)) for s in range(0, n, patch)] for n in size]
@@ -124,18 +114,20 @@ def _examples(denoiser: Denoiser, halves: Halves) -> dict[str, Array]:
 
     All radiance is in units of its mean, which leaves the quotient as it is.
     """
-    level = combination.level_of(halves.frame)
+    units = combination.units_of(halves.frame)
     denoised = [(half, denoiser.bind(half)(half.color)) for half in halves.both()]
-    guides = [combination.guides_of(half, z, level) for half, z in denoised]
-    targets = [half.color / level for half, _ in reversed(denoised)]
-    norms = [(z.mean(-1, keepdims=True) ** 2 + 0.01) / level**2 for _, z in reversed(denoised)]
+    guides = [combination.guides_of(half, z, units) for half, z in denoised]
+    targets = [half.color / units.radiance for half, _ in reversed(denoised)]
+    norms = [
+        (z.mean(-1, keepdims=True) ** 2 + 0.01) / units.radiance**2 for _, z in reversed(denoised)
+    ]
     return {n: jnp.stack(v) for n, v in (("guides", guides), ("target", targets), ("norm", norms))}
 
 
 @jax.jit
 def _noise(halves: Halves) -> Float[Array, ""]:
     """RMS noise of log(1 + radiance), which the network sees, by the halves' difference."""
-    level = combination.level_of(halves.frame)
+    level = combination.units_of(halves.frame).radiance
     a, b = (jnp.log1p(jnp.maximum(half.color, 0) / level) for half in halves.both())
     return jnp.sqrt((((a - b) / 2) ** 2).mean())
 
@@ -175,4 +167,4 @@ def _step(
 @functools.partial(jax.jit, static_argnums=0)
 def _corrected(correction: PostCorrection, params: Params, guides: Array, frame: Frame) -> Array:
     parts = jax.vmap(functools.partial(correction.apply, params))(guides)
-    return combination.level_of(frame) * parts.mean(0)
+    return combination.units_of(frame).radiance * parts.mean(0)

@@ -19,13 +19,17 @@ from jaxtyping import Float, Int
 from progden_jax import _checks
 from progden_jax._program import checked_variance
 from progden_jax.adaptation import _blocks, _leaves
-from progden_jax.adaptation._descent import Weights, descent, risks, task_of
+from progden_jax.adaptation._descent import Task, Weights, descent, risks, task_of
 from progden_jax.adaptation._mixed import Mixed
 from progden_jax.adaptation._running import Progress, generator
+from progden_jax.adaptation.correction import Params, PostCorrected, PostCorrection
 from progden_jax.denoisers import Denoiser
 from progden_jax.denoisers._base import passable
 from progden_jax.frame import Frame, repaired
 from progden_jax.mixing import Mixer
+
+_RATE, _NEW_RATE = 1e-4, 2e-3
+"""Of weights that were trained, and of new ones."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +39,7 @@ class Adaptation:
     Parameters
     ----------
     steps : of Adam, at most.
-    rate : its learning rate.
+    rate : its learning rate; None: 1e-4, and 2e-3 for `correct_by_sure`, which starts from nothing.
     only : names of layers or attributes to change, such as ("dec_conv1a", "dec_conv0") of a U-Net;
         none stands for all weights.
     crop : edge in pixels of the part that a step looks at, if the image is larger; memory grows with it.
@@ -50,7 +54,7 @@ class Adaptation:
     """
 
     steps: int = 100
-    rate: float = 1e-4
+    rate: float | None = None
     only: tuple[str, ...] = ()
     crop: int = 256
     block: int = 16
@@ -63,7 +67,7 @@ class Adaptation:
     def __post_init__(self) -> None:
         for name in ("steps", "crop", "block", "every", "patience", "probes"):
             _checks.positive_int(name, getattr(self, name))
-        if not 0 < self.rate < math.inf:
+        if self.rate is not None and not 0 < self.rate < math.inf:
             raise ValueError(f"rate is {self.rate}, expected a number above 0, such as 1e-4.")
         if not 0 <= self.confidence < math.inf:
             raise ValueError(
@@ -165,6 +169,48 @@ def adapt_mixer(
     return found._replace(adapted=found.adapted.mixer)
 
 
+def correct_by_sure(
+    frame: Frame,
+    denoiser: Denoiser,
+    *,
+    correction: PostCorrection | None = None,
+    adaptation: Adaptation | None = None,
+    start: Params | None = None,
+    key: jax.Array | None = None,
+    progress: Progress = lambda done, total: None,
+) -> Adapted:
+    """The denoiser followed by the network of `post_correct`, fitted by SURE: no halves are needed.
+
+    So the network sees all samples at once, a step looks at one image in the place of two, and blocks of the
+    image that nothing is fitted to say when to stop. All else as for `adapt`; ``adapted`` is a
+    `PostCorrected`, or the denoiser where no gain is sure.
+
+    Parameters
+    ----------
+    correction : the network; how it is fitted is in `adaptation`.
+    start : weights to start from, such as ``adapted.params`` of the previous frame; None: those that keep
+        most of the denoised image's detail.
+
+    Raises
+    ------
+    ValueError
+        As by `adapt`, or if the weights are not the correction's.
+    """
+    correction = PostCorrection() if correction is None else correction
+    adaptation = Adaptation() if adaptation is None else adaptation
+    if adaptation.rate is None:
+        adaptation = dataclasses.replace(adaptation, rate=_NEW_RATE)
+    start_key, fit_key = jax.random.split(jax.random.key(0) if key is None else key)
+    params = _unchanging(correction, start_key) if start is None else correction.checked(start)
+    denoiser = passable(denoiser)
+    behind = PostCorrected(denoiser, params, {}, correction)
+    chosen = _leaves.chosen(behind, ("params",))
+    return _fit(frame, behind, chosen, adaptation, fit_key, progress, over=denoiser)
+
+
+_unchanging = jax.jit(PostCorrection.unchanging, static_argnums=0)
+
+
 def _fit(
     frame: Frame,
     denoiser: Any,
@@ -172,30 +218,37 @@ def _fit(
     adaptation: Adaptation,
     key: jax.Array,
     progress: Progress,
+    over: Any = None,
 ) -> Adapted:
+    """`over` is what there is before, and stays where no gain over it is sure; None: those first weights."""
     checked_variance(frame)
     frame = repaired(frame)
     step_key, look_key, host_key = jax.random.split(key, 3)
     host = generator(host_key)
     kinds = _blocks.kinds(frame.size, adaptation.block, host)
     fitting, choosing, telling = (kinds == kind for kind in _blocks.KINDS)
-    task = task_of(denoiser, frame, chosen, adaptation.probes)
+    task = before = task_of(denoiser, frame, chosen, adaptation.probes)
+    if over is not None:
+        before = task_of(over, frame, (), adaptation.probes)
+        task = dataclasses.replace(task, scale=before.scale)
     if not adaptation.covariance:
-        task = dataclasses.replace(task, shared=jnp.zeros_like(task.shared))
+        shared = jnp.zeros_like(task.shared)
+        task, before = (dataclasses.replace(t, shared=shared) for t in (task, before))
 
-    def look(step: int, weights: Weights) -> _Seen:
+    def look(task: Task, step: int, weights: Weights) -> _Seen:
         probed = np.asarray(risks(task, weights, look_key), np.float64)
         return _Seen(step, weights, _blocks.means(probed.mean(-1), kinds.shape))
 
-    start = best = look(0, task.first)
+    start = best = look(before, 0, before.first)
     looks = [(0, start.risks[choosing].mean())]
     part = task.only_in(_blocks.spread(fitting, frame.size))
-    steps = descent(part, adaptation.crop, adaptation.rate, step_key, host)
+    rate = _RATE if adaptation.rate is None else adaptation.rate
+    steps = descent(part, adaptation.crop, rate, step_key, host)
     for step, weights in enumerate(itertools.islice(steps, adaptation.steps), 1):
         stopped = progress(step, adaptation.steps) is False
         if step % adaptation.every and step < adaptation.steps and not stopped:
             continue
-        seen = look(step, weights)
+        seen = look(task, step, weights)
         looks.append((step, seen.risks[choosing].mean()))
         if looks[-1][1] < best.risks[choosing].mean():
             best = seen
@@ -206,7 +259,7 @@ def _fit(
         best = start
     numbers, values = zip(*looks, strict=True)
     return Adapted(
-        task.with_weights(best.weights),
+        (task if best.step else before).with_weights(best.weights),
         best.step,
         before=float(start.risks[telling].mean()),
         after=float(best.risks[telling].mean()),

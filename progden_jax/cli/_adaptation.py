@@ -44,7 +44,7 @@ class AdaptOptions:
         bool,
         Parameter(
             help="Repair the denoised image by a small network that learns from two halves of the render "
-            "(Back et al. 2022)."
+            "(Back et al. 2022); with --adapt from the whole, by Stein's estimate."
         ),
     ] = False
     halves: Annotated[
@@ -59,7 +59,7 @@ class AdaptOptions:
     adapt_steps: Annotated[
         int | None,
         Parameter(
-            help="Steps of fitting [default: 100 at most; 20 epochs of --post-correct, at least 80]."
+            help="Steps of fitting [default: 100 at most; 20 epochs of --post-correct alone, at least 80]."
         ),
     ] = None
     sequence: Annotated[
@@ -77,13 +77,10 @@ class AdaptOptions:
 
     def check(self, read: ReadOptions, network: NetworkOptions, cost: CostOptions) -> None:
         """Raise UsageError for what is wrong whatever the files hold."""
-        if self.adapt and self.post_correct:
+        if self.adapt and not self.post_correct and network.denoiser == NFOR:
             raise UsageError(
-                "--adapt changes the denoiser's weights, --post-correct adds a network behind it: give one "
-                "of them."
+                "--adapt fits a network's weights, and --denoiser nfor has none: add --post-correct."
             )
-        if self.adapt and network.denoiser == NFOR:
-            raise UsageError("--adapt fits a network's weights, and --denoiser nfor has none.")
         if self.adapt_steps is not None and not self.fits:
             raise UsageError("--adapt-steps is for --adapt or --post-correct: give one of them.")
         if self.adapt_steps is not None and self.adapt_steps < 1:
@@ -103,6 +100,10 @@ class AdaptOptions:
             raise UsageError(
                 f"--halves names {len(self.halves or ())} renders, expected two, after IN and before other "
                 "flags."
+            )
+        if self.adapt:
+            raise UsageError(
+                "--adapt fits to the whole render, --halves are for --post-correct alone: leave one out."
             )
         if not self.post_correct and network.denoiser != NFOR:
             raise UsageError(
@@ -124,6 +125,13 @@ class Handed:
 
     def __init__(self) -> None:
         self.params: Params | None = None
+
+    def take(self, denoiser: "Denoiser", options: AdaptOptions) -> None:
+        """What is to be handed on: in a sequence, and where there is a correction."""
+        from progden_jax.adaptation import PostCorrected
+
+        corrected = options.sequence and isinstance(denoiser, PostCorrected)
+        self.params = denoiser.params if corrected else None
 
 
 def read_halves(item: Item, frame: "Frame", read: "Settings", outcome: "Outcome") -> "Halves":
@@ -186,21 +194,28 @@ def adapted(
     start = time.perf_counter()
     steps = options.adapt_steps
     if options.adapt:
-        found = adaptation.adapt(
-            frame,
-            denoiser,
-            adaptation=None if steps is None else adaptation.Adaptation(steps=steps),
-            key=key,
-            progress=lambda done, total: progress(done, total, of="the adaptation"),
-        )
+        how: dict[str, Any] = {
+            "adaptation": None if steps is None else adaptation.Adaptation(steps=steps),
+            "key": key,
+            "progress": lambda done, total: progress(done, total, of="the adaptation"),
+        }
+        if options.post_correct:
+            found = adaptation.correct_by_sure(
+                frame, denoiser, correction=adaptation.PostCorrection(), start=handed.params, **how
+            )
+        else:
+            found = adaptation.adapt(frame, denoiser, **how)
         outcome.adaptation = {
-            "kind": "sure",
+            "kind": "sure-correct" if options.post_correct else "sure",
             "steps": found.step,
             "risk_before": found.before,
             "risk_after": found.after,
             "risk_error": found.error,
         }
         denoiser = found.adapted
+        if options.post_correct:
+            outcome.adaptation["reused"] = handed.params is not None
+            handed.take(denoiser, options)
     elif options.post_correct:
         split_key, fit_key = jax.random.split(key)
         if halves is None:
@@ -223,9 +238,8 @@ def adapted(
             "halves": "split by the variance" if halves is None else "given",
             "reused": handed.params is not None,
         }
-        if options.sequence:
-            handed.params = corrected.denoiser.params
         denoiser = corrected.denoiser
+        handed.take(denoiser, options)
     elif halves is not None:
         return adaptation.WithHalves(denoiser, halves.difference["color"])
     else:
@@ -236,8 +250,7 @@ def adapted(
 
 def described(found: dict[str, Any]) -> str:
     """What was done, for people."""
-    if found["kind"] == "post-correct":
-        return f"post-corrected in {found['steps']} steps"
+    done = "adapted" if found["kind"] == "sure" else "post-corrected"
     if not found["steps"]:
-        return "not adapted, as no gain was sure"
-    return f"adapted in {found['steps']} steps"
+        return f"not {done}, as no gain was sure"
+    return f"{done} in {found['steps']} steps"
