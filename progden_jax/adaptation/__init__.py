@@ -6,9 +6,10 @@ denoiser's, or with `adapt_mixer` a mixer's, own weights. What comes out can be 
 `progden_jax.progressive_denoise`.
 """
 
+from progden_jax.adaptation._fit import Adaptation, Adapted
 from progden_jax.adaptation._halves import Halves, WithHalves, halves, split
 from progden_jax.adaptation.by_halves import Corrected, post_correct
-from progden_jax.adaptation.by_sure import Adaptation, Adapted, adapt, adapt_mixer, correct_by_sure
+from progden_jax.adaptation.by_sure import adapt, adapt_mixer, correct_by_sure
 from progden_jax.adaptation.correction import SETTINGS, PostCorrected, PostCorrection
 
 __all__ = [
