@@ -408,6 +408,7 @@ def test_a_correction_is_fitted_by_sure(corrected):
     frame = halves.frame
     found = adaptation.correct_by_sure(frame, bright, correction=SMALL, adaptation=settings)
     assert isinstance(found.adapted, adaptation.PostCorrected)
+    assert jax.tree.leaves(found.adapted.denoiser) == jax.tree.leaves(bright)
     before, after = (((np.asarray(f(frame)) - truth) ** 2).mean() for f in (bright, found.adapted))
     assert after < 0.1 * before
     assert found.after < found.before

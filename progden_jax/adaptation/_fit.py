@@ -77,7 +77,7 @@ class Adapted(NamedTuple):
     ----------
     adapted : the denoiser, or the mixer, with the weights that were best; those before where none was surely
         better.
-    step : after which they were found, 0: unchanged.
+    step : after which they were found, 0: those to start from, or unchanged.
     before, after : risk where nothing was fitted or chosen; a single value is noisy.
     error : standard error of `before` minus `after`, over blocks.
     steps : at which the blocks that choose were looked at,

@@ -102,8 +102,8 @@ def correct_by_sure(
     """The denoiser followed by the network of `post_correct`, fitted by SURE: no halves are needed.
 
     So the network sees all samples at once, a step looks at one image in the place of two, and blocks of the
-    image that nothing is fitted to say when to stop. All else as for `adapt`; ``adapted`` is a
-    `PostCorrected`, or the denoiser where no gain is sure.
+    image that nothing is fitted to say when to stop. The denoiser keeps its weights. All else as for `adapt`;
+    ``adapted`` is a `PostCorrected`, or the denoiser where no gain is sure.
 
     Parameters
     ----------
@@ -124,7 +124,8 @@ def correct_by_sure(
     params = _unchanging(correction, start_key) if start is None else correction.checked(start)
     denoiser = passable(denoiser)
     behind = PostCorrected(denoiser, params, {}, correction)
-    chosen = _leaves.chosen(behind, ("params",))
+    before = len(jax.tree.leaves(denoiser))
+    chosen = tuple(before + number for number in _leaves.chosen(params, adaptation.only))
     return fit(frame, behind, chosen, adaptation, fit_key, progress, over=denoiser)
 
 

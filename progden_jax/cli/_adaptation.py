@@ -251,6 +251,6 @@ def adapted(
 def described(found: dict[str, Any]) -> str:
     """What was done, for people."""
     done = "adapted" if found["kind"] == "sure" else "post-corrected"
-    if not found["steps"]:
+    if found["kind"] != "post-correct" and found["risk_after"] == found["risk_before"]:
         return f"not {done}, as no gain was sure"
     return f"{done} in {found['steps']} steps"
