@@ -44,7 +44,8 @@ class AdaptOptions:
         bool,
         Parameter(
             help="Repair the denoised image by a small network that learns from two halves of the render "
-            "(Back et al. 2022); with --adapt from the whole, by Stein's estimate. SURE is too low behind either."
+            "(Back et al. 2022); with --adapt from the whole, by Stein's estimate. SURE is too low behind "
+            "either."
         ),
     ] = False
     halves: Annotated[
