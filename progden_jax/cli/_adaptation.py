@@ -131,8 +131,9 @@ class Handed:
         """What is to be handed on: in a sequence, and where there is a correction."""
         from progden_jax.adaptation import PostCorrected
 
-        corrected = options.sequence and isinstance(denoiser, PostCorrected)
-        self.params = denoiser.params if corrected else None
+        self.params = None
+        if options.sequence and isinstance(denoiser, PostCorrected):
+            self.params = denoiser.params
 
 
 def read_halves(item: Item, frame: "Frame", read: "Settings", outcome: "Outcome") -> "Halves":
