@@ -220,9 +220,9 @@ def test_weights_that_vanish_have_derivatives(guides):
 
 def test_one_pixel_is_its_own_mean():
     frame = pd.Frame(np.full((1, 1, 3), 2.0, np.float32), np.ones((1, 1, 3), np.float32))
-    seen = combination.guides_of(frame, frame.color)
+    seen = combination.guides_of(frame, frame.color, combination.units_of(frame))
     params = drawn(jax.eval_shape(SMALL.init, jax.random.key(0)))
-    np.testing.assert_allclose(jax.jit(SMALL.apply)(params, seen), frame.color, rtol=1e-6)
+    np.testing.assert_allclose(jax.jit(SMALL.apply)(params, seen), 1, rtol=1e-6)
 
 
 def test_the_networks_are_those_of_table_1():
@@ -318,6 +318,31 @@ def test_post_correction_goes_on_from_weights_and_follows_its_key(corrected):
         adaptation.post_correct(halves, bright, start=first.denoiser.params)
 
 
+@pytest.mark.parametrize(("unit", "fireflies"), [(1e-3, ()), (1e2, ((3, 4), (15, 20)))])
+def test_post_correction_learns_in_any_unit_and_beside_fireflies(corrected, unit, fireflies):
+    """By its own rate: neither so low that nothing is learned, nor so high that the network dies."""
+    halves, bright, settings, _, truth = corrected
+    color, variance = (np.array(a) for a in (halves.frame.color, halves.frame.variance))
+    calm = np.ones(halves.frame.size, bool)
+    for row, column in fireflies:
+        color[row, column], variance[row, column] = 300, 300**2
+        calm[row - 2 : row + 3, column - 2 : column + 3] = False
+    frame = halves.frame.replace(color=unit * color, variance=unit**2 * variance)
+    scaled = dataclasses.replace(bright, rest=unit * bright.rest)
+    found = adaptation.post_correct(
+        adaptation.split(frame, jax.random.key(5)),
+        scaled,
+        correction=dataclasses.replace(settings, rate=None, steps=120),
+    )
+    before, after = (
+        ((np.asarray(i) / unit - truth)[calm] ** 2).mean() for i in (scaled(frame), found.image)
+    )
+    assert after < 0.2 * before
+    # 0.01 times the noise over the mean, at which log(1 + ·) has half of it. The fireflies' own RMS is 17.
+    usual = 0.01 * 0.1 / np.asarray(halves.frame.color).mean() / 2
+    assert 0.9 * usual < found.rate < (3 if fireflies else 1.1) * usual
+
+
 def test_patches_cover_the_image():
     from progden_jax.adaptation.by_halves import _corners
 
@@ -374,6 +399,32 @@ def test_only_some_weights(adapted):
     assert found.adapted.rest != dim.rest
     with pytest.raises(ValueError, match="only names conv9, expected some of gain, rest"):
         adaptation.adapt(frame, dim, adaptation=dataclasses.replace(some, only=("conv9",)))
+
+
+def test_a_correction_is_fitted_by_sure(corrected):
+    """To one image, no halves; where a step makes nothing better, the denoiser stays as it is."""
+    halves, bright, _, _, truth = corrected
+    settings = dataclasses.replace(SURE, steps=60, rate=None, every=20)
+    frame = halves.frame
+    found = adaptation.correct_by_sure(frame, bright, correction=SMALL, adaptation=settings)
+    assert isinstance(found.adapted, adaptation.PostCorrected)
+    assert jax.tree.leaves(found.adapted.denoiser) == jax.tree.leaves(bright)
+    before, after = (((np.asarray(f(frame)) - truth) ** 2).mean() for f in (bright, found.adapted))
+    assert after < 0.1 * before
+    assert found.after < found.before
+    hardly = dataclasses.replace(settings, steps=1, confidence=1e3)
+    same = adaptation.correct_by_sure(frame, bright, correction=SMALL, adaptation=hardly)
+    assert same.step == 0
+    assert jax.tree.leaves(same.adapted) == jax.tree.leaves(bright)
+    settings = dataclasses.replace(settings, steps=1)
+    again = adaptation.correct_by_sure(
+        frame, bright, correction=SMALL, adaptation=settings, start=found.adapted.params
+    )
+    assert isinstance(again.adapted, adaptation.PostCorrected)
+    assert again.risks[0] == pytest.approx(found.risks.min(), rel=1e-4)
+    assert again.risks[0] < found.risks[0]
+    with pytest.raises(ValueError, match="other shapes"):
+        adaptation.correct_by_sure(frame, bright, start=found.adapted.params)
 
 
 @jax.tree_util.register_dataclass

@@ -820,7 +820,7 @@ CONTRADICTIONS = [
     "--clean-aux --prefilter",
     "--prefilter --denoiser oidn-hdr-alb-nrm",
     "--variance-of std --variance-from b.exr",
-    "--adapt --post-correct",
+    "--adapt --post-correct --halves a.exr b.exr",
     "--adapt --denoiser nfor",
     "--adapt --max-memory 1GiB",
     "--adapt --sequence",

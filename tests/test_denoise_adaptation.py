@@ -55,8 +55,8 @@ def few_layers(monkeypatch):
 def denoise(network, capsys):
     """Run the command with that network; gives the status, what --json told, and stderr."""
 
-    def call(*words):
-        words = ["denoise", *words, "--denoiser", network, "--mixer", "closed-form", "--json"]
+    def call(*words, denoiser=network):
+        words = ["denoise", *words, "--denoiser", denoiser, "--mixer", "closed-form", "--json"]
         status = main([str(word) for word in words])
         out, err = capsys.readouterr()
         assert "Traceback" not in err
@@ -119,12 +119,39 @@ def test_a_sequence_is_corrected_by_its_halves(halves, few_layers, denoise, monk
     assert sorted(p.name for p in (halves / "out").iterdir()) == sorted(names)
 
 
+def test_a_correction_is_fitted_by_sure(halves, few_layers, denoise, monkeypatch):
+    """From the whole render; frames of a sequence go on from the weights of the one before."""
+    (halves / "in").mkdir()
+    for name in ("one.exr", "two.exr"):
+        (halves / "in" / name).write_bytes((halves / "whole.exr").read_bytes())
+    given = []
+
+    def correct(frame, denoiser, *, correction, adaptation, start, key, progress):
+        given.append((adaptation.steps, start, jax.random.key_data(key).tolist()))
+        params = jax.tree.map(np.ones_like, correction.init(jax.random.key(0)))
+        behind = PostCorrected(denoiser, params, {}, correction)
+        return adapted(behind, 2, 0.5, 0.25, 0.125, np.arange(2), np.arange(2.0))
+
+    PostCorrected, adapted = adaptation.PostCorrected, adaptation.Adapted
+    monkeypatch.setattr(adaptation, "correct_by_sure", correct)
+    words = ["--adapt", "--post-correct", "--sequence", "--adapt-steps", 3]
+    status, told, err = denoise(halves / "in", "-o", halves / "out", *words)
+    assert (status, err) == (0, "")
+    (first, *_), (second, weights, key) = given
+    assert (first, second, given[0][1]) == (3, 3, None)
+    assert jax.tree.all(jax.tree.map(lambda w: (w == 1).all(), weights))
+    assert key == jax.random.key_data(jax.random.fold_in(jax.random.key(0), 1)).tolist()
+    assert [t["adaptation"]["kind"] for t in told] == ["sure-correct"] * 2
+    assert [t["adaptation"]["reused"] for t in told] == [False, True]
+    assert told[0]["adaptation"]["risk_after"] == 0.25
+
+
 def test_the_input_may_be_one_of_the_halves(halves, few_layers, denoise):
     out = halves / "out.exr"
-    words = ["--post-correct", "--adapt-steps", 1, "--save", "noisy,variance"]
+    words = ["--post-correct", "--adapt-steps", 1, "--save", "noisy,variance,sure"]
     pair = ["--halves", halves / "a.exr", halves / "b.exr"]
-    status, _, _ = denoise(halves / "a.exr", "-o", out, *words, *pair)
-    assert status == 0
+    status, _, err = denoise(halves / "a.exr", "-o", out, *words, *pair)
+    assert (status, "SURE is too low behind a denoiser that was fitted" in err) == (0, True)
     written = pd.exr.read_layers(out)
     whole = read_exr(halves / "whole.exr")
     np.testing.assert_allclose(written["noisy"], whole.color, atol=1e-6)
@@ -183,6 +210,20 @@ def test_what_does_not_go_with_sub_averages(
     assert (status, told) == (2, None)
     assert message in err
     assert not (halves / "out.exr").exists()
+
+
+def test_nfor_filters_the_halves_by_each_other(halves, denoise, monkeypatch):
+    nfor = pd.denoisers.NFOR(radius=1, patch=1, bandwidths=(1.0,), inputs=())
+    monkeypatch.setattr(pd.denoisers, "NFOR", lambda **_: nfor)
+    out, pair = halves / "out.exr", [halves / f"{name}.exr" for name in "ab"]
+    words = ["--save", "denoised", "--halves", *pair]
+    status, (told,), err = denoise(halves / "whole.exr", "-o", out, *words, denoiser="nfor")
+    assert (status, err) == (0, "")
+    assert (told["denoiser"], told["adaptation"]) == ("nfor", None)
+    frame = read_exr(halves / "whole.exr")
+    f = nfor.bind(frame, halves=tuple(read_exr(half).color for half in pair))
+    written = pd.exr.read_layers(out)["denoised"]
+    np.testing.assert_allclose(written, f(frame.color), atol=1e-5)
 
 
 def test_an_interrupt_leaves_nothing(halves, denoise, monkeypatch):

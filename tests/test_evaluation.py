@@ -28,7 +28,7 @@ from progden_jax.cli import main
 from progden_jax.denoisers import FunctionDenoiser
 from progden_jax.evaluation import exports, statistics
 from progden_jax.evaluation.database import Database, Row
-from progden_jax.evaluation.parts import load_denoiser
+from progden_jax.evaluation.parts import adapted, load_denoiser
 from progden_jax.evaluation.plan import PRESETS
 from progden_jax.evaluation.risk import risk_of_held, risk_of_mix
 from progden_jax.evaluation.settings import parse
@@ -149,6 +149,24 @@ def test_a_denoiser_is_adapted_to_each_render(renders, tmp_path):
     plan = plan_of(renders, ["denoised"], adaptation="sure")
     assert evaluation.carry_out(plan, tmp_path / "sure", report=report).failed == 4
     assert "has no weights to adapt" in report.failures[0]
+
+
+def test_settings_of_a_correction_by_sure(monkeypatch, images):
+    """Of the network and of its fit, both."""
+    told = {"adaptation.steps": 7, "correction.window": 3}
+    settings = parse({"image": "denoised", "adaptation": "sure-correct", **told}, source="")
+    assert settings.flat().items() >= told.items()
+    given = {}
+
+    def correct(frame, denoiser, **how):
+        given.update(how)
+        return adaptation.Adapted("fitted", 1, 0.0, 0.0, 0.0, np.zeros(1, int), np.zeros(1))
+
+    monkeypatch.setattr(adaptation, "correct_by_sure", correct)
+    frame = pd.Frame(images.x, images.variance)
+    assert adapted(frame, FunctionDenoiser(jax.numpy.tanh), settings) == "fitted"
+    assert given["adaptation"] == adaptation.Adaptation(steps=7)
+    assert given["correction"] == adaptation.PostCorrection(window=3)
 
 
 def known_of(result, frame):

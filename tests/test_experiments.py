@@ -17,6 +17,7 @@ from conftest import DEMO
 
 import progden_jax as pd
 from experiments import _common, _plots, _training
+from experiments.adaptation import equal_time, processor
 from experiments.adaptation import renders as normal_renders
 from experiments.divergence import methods
 from experiments.fig2 import plot as fig2
@@ -268,6 +269,46 @@ def test_renders_of_normal_noise(command, noisy, tmp_path):
     np.testing.assert_allclose(frame.variance[6, 8], around, rtol=1e-5)
     spread = (np.asarray(frame.color) - truth.color) / np.sqrt(frame.variance)
     assert 0.9 < spread.std() < 1.1
+
+
+def test_equal_time(command, noisy, tmp_path):
+    """Denoised images are alike; each mix is 0.01 of the render's error worse than the one before."""
+    run = results(EXPERIMENTS / "adaptation" / "equal_time.yaml", noisy, tmp_path)
+    printed = command(equal_time, run, "--output", tmp_path)
+    relmse, ratio = cells(printed, "SURE")
+    assert relmse[1:] == ["0.3536", "0.1768", "0.08839", "0.04419"]
+    assert ratio[1:] == ["1"] * 4 + ["0 of 8"]
+    without, _, corrected = (
+        cells(printed, name)[1]
+        for name in ("unet-hdr, mixed", "SURE, mixed", "post-correction, mixed")
+    )
+    assert without[1:] == [f"{0.6 / 0.61:.4g}"] * 4 + ["8 of 8"]
+    assert corrected[-1] == "0 of 8"
+    assert len(_common.read_csv(tmp_path / "equal_time.csv")) == len(evaluation.rows(run))
+
+
+def test_processor_time_of_fits(command, noisy, tiny, tmp_path):
+    """Per step and for all; methods that share a fit are one line, those that fit nothing none."""
+    config = tmp_path / "fits.yaml"
+    config.write_text(
+        f"""crop: 16
+base: {{denoiser: {tiny}, image: denoised, correction.window: 3, correction.layers: 2, correction.steps: 5}}
+list:
+  - {{label: plain}}
+  - {{label: by halves, adaptation: post-correct}}
+  - {{label: the same mixed, adaptation: post-correct, image: mix}}
+  - {{label: by SURE, adaptation: sure, adaptation.steps: 7, adaptation.block: 4}}
+"""
+    )
+    printed = command(processor, config, "--data", noisy, "--scenes", "1", "--steps", "2")
+    rows = {row[0]: row[1:] for row in cells(printed)[2:]}
+    assert {label: row[1] for label, row in rows.items()} in (
+        {"by halves": "5", "by SURE": "7"},
+        {"the same mixed": "5", "by SURE": "7"},
+    )
+    for each, steps, total in rows.values():
+        assert float(total) == pytest.approx(float(each) * float(steps), rel=1e-2)
+        assert float(each) > 0
 
 
 @pytest.mark.parametrize("name", ["sweep", "fitted"])

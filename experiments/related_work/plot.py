@@ -18,7 +18,11 @@ from progden_jax.evaluation import Row, statistics
 
 METRICS = {n: statistics.METRICS[n] for n in ("relmse", "rmse", "smape", "flip")}
 
-REPAIRS = {"sure": "adapted by SURE", "post-correct": "post-corrected"}
+REPAIRS = {
+    "sure": "adapted by SURE",
+    "post-correct": "post-corrected",
+    "sure-correct": "corrected by SURE",
+}
 
 MIXED = ", mixed"
 
@@ -27,6 +31,7 @@ COLORS = {
     "combined": "tab:blue",
     "adapted by SURE": "tab:red",
     "post-corrected": "tab:green",
+    "corrected by SURE": "tab:purple",
 }
 """By what is done to a denoiser."""
 

@@ -18,8 +18,6 @@ from progden_jax.denoisers import Denoiser
 from progden_jax.denoisers._base import passable
 from progden_jax.frame import Frame
 
-_MAX_RATE = 0.01
-
 
 class Corrected(NamedTuple):
     """What `post_correct` gives.
@@ -30,12 +28,14 @@ class Corrected(NamedTuple):
     denoiser : the same as something that `progressive_denoise` takes for `frame`.
     frame : the mean of both halves.
     losses : of every step, Eq. 9 over its patches.
+    rate : of learning.
     """
 
     image: Float[Array, "h w 3"]
     denoiser: PostCorrected
     frame: Frame
     losses: Float[np.ndarray, " steps"]
+    rate: float
 
 
 def post_correct(
@@ -73,16 +73,14 @@ def post_correct(
     correction = PostCorrection() if correction is None else correction
     key = jax.random.key(0) if key is None else key
     weights_key, order_key = jax.random.split(key)
-    params = _init(correction, weights_key) if start is None else _checked(correction, start)
+    params = _init(correction, weights_key) if start is None else correction.checked(start)
     data = _examples(passable(denoiser), halves)
     size = halves.frame.size
     corners = _corners(size, correction.patch)
     batch = min(correction.batch, len(corners))
     per_epoch = -(-len(corners) // batch)
     total = correction.count(per_epoch)
-    rate = correction.rate
-    if rate is None:
-        rate = min(0.01 * float(jnp.sqrt(jnp.mean(halves.difference["color"] ** 2))), _MAX_RATE)
+    rate = 0.01 * float(_noise(halves)) if correction.rate is None else correction.rate
     patch = (min(correction.patch, size[0]), min(correction.patch, size[1]))
     optimizer = OPTIMIZER.init(params)
     order = generator(order_key)
@@ -97,21 +95,11 @@ def post_correct(
         if progress(step + 1, total) is False:
             break
     corrected = PostCorrected(passable(denoiser), params, halves.difference, correction)
-    image = _corrected(correction, params, data["guides"])
-    return Corrected(image, corrected, halves.frame, np.asarray(losses))
+    image = _corrected(correction, params, data["guides"], halves.frame)
+    return Corrected(image, corrected, halves.frame, np.asarray(losses), rate)
 
 
 _init = jax.jit(PostCorrection.init, static_argnums=0)
-
-
-def _checked(correction: PostCorrection, params: Params) -> Params:
-    expected = jax.eval_shape(correction.init, jax.random.key(0))
-    if jax.tree.map(jnp.shape, params) != jax.tree.map(jnp.shape, expected):
-        raise ValueError(
-            "start holds weights of other shapes than the correction's: give those of a correction with the "
-            "same window, layers, width and setting."
-        )
-    return params
 
 
 def _corners(size: tuple[int, int], patch: int) -> np.ndarray:
@@ -122,12 +110,26 @@ def _corners(size: tuple[int, int], patch: int) -> np.ndarray:
 
 @jax.jit
 def _examples(denoiser: Denoiser, halves: Halves) -> dict[str, Array]:
-    """Of each half the guides, and of the other half what Eq. 8 compares with and divides by."""
+    """Of each half the guides, and of the other half what Eq. 8 compares with and divides by.
+
+    All radiance is in units of its mean, which leaves the quotient as it is.
+    """
+    units = combination.units_of(halves.frame)
     denoised = [(half, denoiser.bind(half)(half.color)) for half in halves.both()]
-    guides = [combination.guides_of(half, z) for half, z in denoised]
-    targets = [half.color for half, _ in reversed(denoised)]
-    norms = [z.mean(-1, keepdims=True) ** 2 + 0.01 for _, z in reversed(denoised)]
+    guides = [combination.guides_of(half, z, units) for half, z in denoised]
+    targets = [half.color / units.radiance for half, _ in reversed(denoised)]
+    norms = [
+        (z.mean(-1, keepdims=True) ** 2 + 0.01) / units.radiance**2 for _, z in reversed(denoised)
+    ]
     return {n: jnp.stack(v) for n, v in (("guides", guides), ("target", targets), ("norm", norms))}
+
+
+@jax.jit
+def _noise(halves: Halves) -> Float[Array, ""]:
+    """RMS noise of log(1 + radiance), which the network sees, by the halves' difference."""
+    level = combination.units_of(halves.frame).radiance
+    a, b = (jnp.log1p(jnp.maximum(half.color, 0) / level) for half in halves.both())
+    return jnp.sqrt((((a - b) / 2) ** 2).mean())
 
 
 def loss(
@@ -163,5 +165,6 @@ def _step(
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _corrected(correction: PostCorrection, params: Params, guides: Array) -> Array:
-    return jax.vmap(functools.partial(correction.apply, params))(guides).mean(0)
+def _corrected(correction: PostCorrection, params: Params, guides: Array, frame: Frame) -> Array:
+    parts = jax.vmap(functools.partial(correction.apply, params))(guides)
+    return combination.units_of(frame).radiance * parts.mean(0)

@@ -1,97 +1,21 @@
-"""Adaptation by SURE: a network's weights fitted to the one noisy image, by its own estimate of its error.
-
-An estimate that is made small is no longer unbiased: weights come to follow the noise that it rests on. So
-the image is cut into blocks of three kinds, drawn at random. The loss is taken in the first alone, where
-to stop is chosen in the second, and the gain is told from the third; the last two with probes of their own,
-the same ones at all times, so that only the weights differ.
-"""
+"""Adaptation by SURE: weights fitted to the one noisy image by Stein's estimate of its error, no halves."""
 
 import dataclasses
-import itertools
-import math
-from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Float, Int
 
-from progden_jax import _checks
-from progden_jax._program import checked_variance
-from progden_jax.adaptation import _blocks, _leaves
-from progden_jax.adaptation._descent import Weights, descent, risks, task_of
+from progden_jax.adaptation import _leaves
+from progden_jax.adaptation._fit import Adaptation, Adapted, fit
 from progden_jax.adaptation._mixed import Mixed
-from progden_jax.adaptation._running import Progress, generator
+from progden_jax.adaptation._running import Progress
+from progden_jax.adaptation.correction import Params, PostCorrected, PostCorrection
 from progden_jax.denoisers import Denoiser
 from progden_jax.denoisers._base import passable
-from progden_jax.frame import Frame, repaired
+from progden_jax.frame import Frame
 from progden_jax.mixing import Mixer
 
-
-@dataclasses.dataclass(frozen=True)
-class Adaptation:
-    """How weights are fitted.
-
-    Parameters
-    ----------
-    steps : of Adam, at most.
-    rate : its learning rate.
-    only : names of layers or attributes to change, such as ("dec_conv1a", "dec_conv0") of a U-Net;
-        none stands for all weights.
-    crop : edge in pixels of the part that a step looks at, if the image is larger; memory grows with it.
-    block : edge in pixels of the blocks that are kept apart.
-    every : steps between looks at the blocks that choose.
-    patience : looks without a new best after which it stops.
-    confidence : by how many standard errors those blocks must be better off for the weights to
-        be changed at all.
-    probes : of the divergence, each time.
-    covariance : whether the estimate counts the noise that a pixel's channels share. Else weights learn to
-        take each channel's noise from the others, unseen.
-    """
-
-    steps: int = 100
-    rate: float = 1e-4
-    only: tuple[str, ...] = ()
-    crop: int = 256
-    block: int = 16
-    every: int = 10
-    patience: int = 4
-    confidence: float = 1.0
-    probes: int = 1
-    covariance: bool = True
-
-    def __post_init__(self) -> None:
-        for name in ("steps", "crop", "block", "every", "patience", "probes"):
-            _checks.positive_int(name, getattr(self, name))
-        if not 0 < self.rate < math.inf:
-            raise ValueError(f"rate is {self.rate}, expected a number above 0, such as 1e-4.")
-        if not 0 <= self.confidence < math.inf:
-            raise ValueError(
-                f"confidence is {self.confidence}, expected a number of standard errors from 0 up."
-            )
-
-
-class Adapted(NamedTuple):
-    """What `adapt` gives; risks are means of SURE / (y² + 0.01 + σ²), y the denoised image before.
-
-    Attributes
-    ----------
-    adapted : the denoiser, or the mixer, with the weights that were best; those before where none was surely
-        better.
-    step : after which they were found, 0: unchanged.
-    before, after : risk where nothing was fitted or chosen; a single value is noisy.
-    error : standard error of `before` minus `after`, over blocks.
-    steps : at which the blocks that choose were looked at,
-    risks : and the risk there, with the advantage of the chosen one.
-    """
-
-    adapted: Any
-    step: int
-    before: float
-    after: float
-    error: float
-    steps: Int[np.ndarray, " n"]
-    risks: Float[np.ndarray, " n"]
+_NEW_RATE = 2e-3
+"""Of weights that are not trained yet."""
 
 
 def adapt(
@@ -134,7 +58,7 @@ def adapt(
     key = jax.random.key(0) if key is None else key
     denoiser = passable(denoiser)
     chosen = _leaves.chosen(denoiser, adaptation.only)
-    return _fit(frame, denoiser, chosen, adaptation, key, progress)
+    return fit(frame, denoiser, chosen, adaptation, key, progress)
 
 
 def adapt_mixer(
@@ -161,64 +85,48 @@ def adapt_mixer(
     mixed = Mixed(passable(denoiser), mixer, mix_key)
     before = len(jax.tree.leaves(mixed.denoiser))
     chosen = tuple(before + number for number in _leaves.chosen(mixer, adaptation.only))
-    found = _fit(frame, mixed, chosen, adaptation, fit_key, progress)
+    found = fit(frame, mixed, chosen, adaptation, fit_key, progress)
     return found._replace(adapted=found.adapted.mixer)
 
 
-def _fit(
+def correct_by_sure(
     frame: Frame,
-    denoiser: Any,
-    chosen: _leaves.Numbers,
-    adaptation: Adaptation,
-    key: jax.Array,
-    progress: Progress,
+    denoiser: Denoiser,
+    *,
+    correction: PostCorrection | None = None,
+    adaptation: Adaptation | None = None,
+    start: Params | None = None,
+    key: jax.Array | None = None,
+    progress: Progress = lambda done, total: None,
 ) -> Adapted:
-    checked_variance(frame)
-    frame = repaired(frame)
-    step_key, look_key, host_key = jax.random.split(key, 3)
-    host = generator(host_key)
-    kinds = _blocks.kinds(frame.size, adaptation.block, host)
-    fitting, choosing, telling = (kinds == kind for kind in _blocks.KINDS)
-    task = task_of(denoiser, frame, chosen, adaptation.probes)
-    if not adaptation.covariance:
-        task = dataclasses.replace(task, shared=jnp.zeros_like(task.shared))
+    """The denoiser followed by the network of `post_correct`, fitted by SURE: no halves are needed.
 
-    def look(step: int, weights: Weights) -> _Seen:
-        probed = np.asarray(risks(task, weights, look_key), np.float64)
-        return _Seen(step, weights, _blocks.means(probed.mean(-1), kinds.shape))
+    So the network sees all samples at once, a step looks at one image in the place of two, and blocks of the
+    image that nothing is fitted to say when to stop. The denoiser keeps its weights. All else as for `adapt`;
+    ``adapted`` is a `PostCorrected`, or the denoiser where no gain is sure.
 
-    start = best = look(0, task.first)
-    looks = [(0, start.risks[choosing].mean())]
-    part = task.only_in(_blocks.spread(fitting, frame.size))
-    steps = descent(part, adaptation.crop, adaptation.rate, step_key, host)
-    for step, weights in enumerate(itertools.islice(steps, adaptation.steps), 1):
-        stopped = progress(step, adaptation.steps) is False
-        if step % adaptation.every and step < adaptation.steps and not stopped:
-            continue
-        seen = look(step, weights)
-        looks.append((step, seen.risks[choosing].mean()))
-        if looks[-1][1] < best.risks[choosing].mean():
-            best = seen
-        if stopped or step - best.step >= adaptation.patience * adaptation.every:
-            break
-    gain, error = _blocks.mean_and_error((start.risks - best.risks)[choosing])
-    if not gain > adaptation.confidence * error:
-        best = start
-    numbers, values = zip(*looks, strict=True)
-    return Adapted(
-        task.with_weights(best.weights),
-        best.step,
-        before=float(start.risks[telling].mean()),
-        after=float(best.risks[telling].mean()),
-        error=_blocks.mean_and_error((start.risks - best.risks)[telling])[1],
-        steps=np.asarray(numbers),
-        risks=np.asarray(values),
-    )
+    Parameters
+    ----------
+    correction : the network; how it is fitted is in `adaptation`.
+    start : weights to start from, such as ``adapted.params`` of the previous frame; None: those that keep
+        most of the denoised image's detail.
+
+    Raises
+    ------
+    ValueError
+        As by `adapt`, or if the weights are not the correction's.
+    """
+    correction = PostCorrection() if correction is None else correction
+    adaptation = Adaptation() if adaptation is None else adaptation
+    if adaptation.rate is None:
+        adaptation = dataclasses.replace(adaptation, rate=_NEW_RATE)
+    start_key, fit_key = jax.random.split(jax.random.key(0) if key is None else key)
+    params = _unchanging(correction, start_key) if start is None else correction.checked(start)
+    denoiser = passable(denoiser)
+    behind = PostCorrected(denoiser, params, {}, correction)
+    before = len(jax.tree.leaves(denoiser))
+    chosen = tuple(before + number for number in _leaves.chosen(params, adaptation.only))
+    return fit(frame, behind, chosen, adaptation, fit_key, progress, over=denoiser)
 
 
-class _Seen(NamedTuple):
-    """The weights after a step, and the risk of every block with them."""
-
-    step: int
-    weights: Weights
-    risks: np.ndarray
+_unchanging = jax.jit(PostCorrection.unchanging, static_argnums=0)

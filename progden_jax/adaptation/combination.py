@@ -6,6 +6,7 @@ and used one offset of the window at a time, in the derivative too.
 """
 
 from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,8 +33,27 @@ Weigh = Callable[[Array, Float[Array, "5 h w"]], Float[Array, "h w"]]
 """From an offset's number in raster order and the squared distances of the guides there to its weight."""
 
 
-def guides_of(frame: Frame, denoised: Float[Array, "h w 3"]) -> Float[Array, "h w 13"]:
-    """The guides of a frame; a buffer that it lacks is 0, depth is in units of its mean.
+class Units(NamedTuple):
+    """What guides are measured in: means over a whole render, so that bandwidths and rates suit any."""
+
+    radiance: Float[Array, ""]
+    depth: Float[Array, ""]
+
+
+def units_of(frame: Frame) -> Units:
+    """The mean radiance and depth; 1 for what is 0 or not there."""
+
+    def mean(buffer: Array | None) -> Array:
+        found = jnp.ones(()) if buffer is None else jnp.maximum(buffer, 0).mean()
+        return jnp.where(found > 0, found, 1)
+
+    return Units(mean(frame.color), mean(frame.depth))
+
+
+def guides_of(
+    frame: Frame, denoised: Float[Array, "h w 3"], units: Units
+) -> Float[Array, "h w 13"]:
+    """The guides of a frame; a buffer that it lacks is 0.
 
     Raises
     ------
@@ -42,16 +62,12 @@ def guides_of(frame: Frame, denoised: Float[Array, "h w 3"]) -> Float[Array, "h 
     """
     _checks.image("frame.color", frame.color)
     _checks.same_shape("denoised", denoised, "frame.color", frame.color)
-    depth = frame.depth
-    if depth is not None:
-        mean = jnp.abs(depth).mean()
-        depth = jnp.where(mean > 0, depth / jnp.where(mean > 0, mean, 1), 0)
     found = {
-        "noisy": frame.color,
-        "denoised": denoised,
+        "noisy": frame.color / units.radiance,
+        "denoised": denoised / units.radiance,
         "albedo": frame.albedo,
         "normal": frame.normal,
-        "depth": depth,
+        "depth": None if frame.depth is None else frame.depth / units.depth,
     }
     parts = []
     for name, channels in GUIDES.items():

@@ -5,6 +5,7 @@ import functools
 import itertools
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,7 @@ from progden_jax import _checks
 from progden_jax._convolution import same_convolution
 from progden_jax.adaptation import combination
 from progden_jax.adaptation._halves import Around, separate
+from progden_jax.adaptation._mixed import bind, exposure_of
 from progden_jax.denoisers import Denoiser
 from progden_jax.denoisers._base import Bound
 from progden_jax.frame import Frame
@@ -29,7 +31,10 @@ _MIN_STEPS = 80
 
 @dataclasses.dataclass(frozen=True)
 class PostCorrection:
-    """What is fitted, and how; the defaults are the paper's (section 4.2).
+    """What is fitted, and how; the defaults are the paper's (section 4.2), but for `rate`.
+
+    Radiance is in units of the render's mean, see `combination.Units`: the paper's bandwidths and rates
+    suit renders of about that brightness, and in dark ones its network learns nothing.
 
     Parameters
     ----------
@@ -40,7 +45,8 @@ class PostCorrection:
     epochs : passes over the image's patches.
     patch, batch : width of the patches in pixels, at most the image's, and how many make a step.
     steps : instead of epochs; None: those that the epochs have, but at least 80.
-    rate : learning rate of Adam; None: 0.01 times the render's RMS noise by its halves, at most 0.01.
+    rate : learning rate of Adam; None: 0.01 times the RMS noise of log(1 + radiance), by the halves. By the
+        paper it is that of radiance, which fireflies and bright renders raise until the network dies.
     """
 
     refined: bool = True
@@ -86,8 +92,32 @@ class PostCorrection:
             params[f"conv{n}"] = {"kernel": kernel, "bias": jnp.zeros(after, part.dtype)}
         return params
 
+    def checked(self, params: Params) -> Params:
+        """The weights, if they are this correction's.
+
+        Raises
+        ------
+        ValueError
+            If their shapes are others.
+        """
+        expected = jax.eval_shape(self.init, jax.random.key(0))
+        if jax.tree.map(jnp.shape, params) != jax.tree.map(jnp.shape, expected):
+            raise ValueError(
+                "start holds weights of other shapes than the correction's: give those of a correction with "
+                "the same window, layers, width and setting."
+            )
+        return params
+
+    def unchanging(self, key: jax.Array) -> dict[str, dict[str, Array]]:
+        """Weights to start from that keep most of the denoised image's detail."""
+        params = self.init(key)
+        if self.refined:
+            last = params[f"conv{self.layers}"]
+            last["bias"] = last["bias"].at[:3].set(2)
+        return params
+
     def apply(self, params: Params, guides: Float[Array, "h w 13"]) -> Float[Array, "h w 3"]:
-        """The corrected image of a noisy and a denoised one, see `combination.guides_of`."""
+        """The corrected image of a noisy and a denoised one, see `combination.guides_of`, in their units."""
         last = params[f"conv{self.layers}"]
         radiance = jnp.log1p(jnp.maximum(guides[..., :6], 0))
         h = jnp.concatenate([radiance, guides[..., 6:]], axis=-1)
@@ -129,18 +159,19 @@ SETTINGS = {
 )
 @dataclasses.dataclass(frozen=True)
 class PostCorrected(Around):
-    """A denoiser followed by the correction that was fitted to one frame; `post_correct` makes it.
+    """A denoiser followed by the correction that was fitted to one frame.
 
-    y = f(x) = ½ (g(x + d) + g(x − d)), where g is denoiser and correction of one half, and d, half of the
-    halves' difference, is a constant. Normal noise in x is independent of d, so that σ²·∂f/∂x at fixed d is
-    what SURE needs, and progressive mixing works as with any denoiser. What is left out is that the
-    correction's weights were fitted to the same noise.
+    After `post_correct` y = f(x) = ½ (g(x + d) + g(x − d)), where g is denoiser and correction of one half,
+    and d, half of the halves' difference, is a constant. Normal noise in x is independent of d, so that
+    σ²·∂f/∂x at fixed d is what SURE needs, and progressive mixing works as with any denoiser. What is left
+    out is that the correction's weights were fitted to the same noise. After `correct_by_sure` there are no
+    halves, and f is g.
 
     Parameters
     ----------
-    denoiser : of each half.
+    denoiser : of each half, or of the frame.
     params : the correction's weights.
-    difference : (a − b)/2 by buffer, see `Halves`.
+    difference : (a − b)/2 by buffer, see `Halves`; empty if there are no halves.
     correction : the settings that the weights belong to.
     """
 
@@ -149,16 +180,24 @@ class PostCorrected(Around):
     difference: dict[str, Array]
     correction: PostCorrection
 
-    def bind(self, frame: Frame) -> Bound:
-        """f with y = f(x); `frame` must be of the size of the one that it was fitted to."""
-        bound = [(half, self.denoiser.bind(half)) for half in separate(frame, self.difference)]
-        shift = self.difference["color"]
+    def exposure_of(self, frame: Frame, valid: None) -> tuple[Any, combination.Units]:
+        """What depends on the whole image: the denoiser's exposure, if it has one, and the units."""
+        del valid
+        return exposure_of(self.denoiser, frame), combination.units_of(frame)
+
+    def bind(self, frame: Frame, *, exposure: tuple[Any, combination.Units] | None = None) -> Bound:
+        """f with y = f(x); with halves `frame` must be of the size of the one that it was fitted to."""
+        inner, units = (None, combination.units_of(frame)) if exposure is None else exposure
+        parts = separate(frame, self.difference) if self.difference else (frame,)
+        bound = [(part, bind(self.denoiser, part, inner)) for part in parts]
 
         def f(x: Array) -> Array:
-            parts = []
-            for (half, inner), color in zip(bound, (x + shift, x - shift), strict=True):
-                guides = combination.guides_of(half.replace(color=color), inner(color))
-                parts.append(self.correction.apply(self.params, guides))
-            return (parts[0] + parts[1]) / 2
+            shift = self.difference.get("color")
+            colors = (x,) if shift is None else (x + shift, x - shift)
+            found = []
+            for (part, denoise), color in zip(bound, colors, strict=True):
+                guides = combination.guides_of(part.replace(color=color), denoise(color), units)
+                found.append(self.correction.apply(self.params, guides))
+            return units.radiance * sum(found) / len(found)
 
         return f

@@ -13,7 +13,14 @@ import numpy as np
 import progden_jax as pd
 from progden_jax import memory, mixers
 from progden_jax.batch import Once, Size, canvas_of, shared_canvases
-from progden_jax.cli._adaptation import AdaptOptions, Handed, adapted, described, read_parts
+from progden_jax.cli._adaptation import (
+    FITTED_SURE,
+    AdaptOptions,
+    Handed,
+    adapted,
+    described,
+    read_parts,
+)
 from progden_jax.cli._compare import Scores, compare
 from progden_jax.cli._options import (
     SAVE_ALWAYS,
@@ -153,6 +160,8 @@ def process(item: Item, settings: Settings, outcome: Outcome, progress: Progress
     denoiser = adapted(
         frame, denoiser, parts, settings.adaptation, key, settings.handed, outcome, progress
     )
+    if settings.adaptation.fits and "sure" in settings.save:
+        outcome.warnings.append(FITTED_SURE)
     images, checkpoint = _denoise(item, frame, denoiser, settings, outcome, progress)
     if reference is not None:
         outcome.metrics = _measure(images, frame, reference)

@@ -48,6 +48,7 @@ progden denoise frames/ -o clean/ --resume
 progden denoise room.exr -o clean.exr --variance-from roomA.exr roomB.exr
 progden denoise room.exr -o clean.exr --adapt
 progden denoise room.exr -o clean.exr --post-correct --halves roomA.exr roomB.exr
+progden denoise room.exr -o clean.exr --adapt --post-correct
 progden denoise huge.exr -o clean.exr --max-memory 4GiB
 progden denoise room.exr -o clean.exr --denoiser nfor --combiner nfor
 progden denoise room.exr -o clean.exr --combiner two.safetensors --halves roomA.exr roomB.exr

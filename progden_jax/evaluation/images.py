@@ -15,7 +15,7 @@ from progden_jax.denoisers import Denoiser, Network
 from progden_jax.evaluation import parts
 from progden_jax.evaluation.cost import Cost, metered
 from progden_jax.evaluation.risk import risk_of_held, risk_of_mix
-from progden_jax.evaluation.settings import Settings
+from progden_jax.evaluation.settings import NONE, Settings
 from progden_jax.subaverages import SubAverages
 from progden_jax.survey import frame_of
 from progden_jax.training.evaluation import oracle_alpha
@@ -59,14 +59,14 @@ def estimate(
     `divided` are the frame's sub-averages, for a combiner of such.
     """
     denoiser = parts.denoiser_for(frame, settings)
-    if isinstance(denoiser, Network) and settings.adaptation != "post-correct":
+    if isinstance(denoiser, Network) and settings.fit()[1] is None:
         taken = {n: getattr(frame, n) for n in ("color", "variance", *denoiser.inputs)}
         frame = frame_of({name: buffer for name, buffer in taken.items() if buffer is not None})
     fitted: Any = denoiser
     fitting = Cost(0.0)
     if divided is not None:
         fitted = BufferedCombiner.of(cast(DeepCombiner, denoiser), divided)
-    if settings.fit() is not None:
+    if settings.adaptation != NONE:
         fitted, fitting = metered(lambda: parts.adapted(frame, denoiser, settings))
     made = functools.partial(Estimate, frame, denoiser, fitted)
     method = settings.method()

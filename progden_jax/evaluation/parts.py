@@ -43,7 +43,7 @@ def sub_averages(settings: Settings) -> int:
     if settings.image == "render" or settings.combiner == NONE:
         return 1
     count = _read_combiner(settings.combiner).network.buffers
-    if count > 1 and settings.fit() is not None:
+    if count > 1 and settings.adaptation != NONE:
         raise ValueError(
             f"combiner is {settings.combiner}, which combines {count} sub-averages, and adaptation is "
             f"{settings.adaptation!r}, which fits to one image: set one of them to none."
@@ -55,13 +55,19 @@ def adapted(frame: Frame, denoiser: Denoiser, settings: Settings) -> Denoiser:
     """The denoiser adapted to the render as the settings say, or as it is."""
     # Other numbers than the probes of the divergence.
     key = jax.random.fold_in(jax.random.key(settings.seed), 1)
-    how = settings.fit()
-    if isinstance(how, adaptation.Adaptation):
-        return adaptation.adapt(frame, denoiser, adaptation=how, key=key).adapted
-    if isinstance(how, adaptation.PostCorrection):
+    fitting, correction = settings.fit()
+    if fitting is not None and correction is not None:
+        return adaptation.correct_by_sure(
+            frame, denoiser, correction=correction, adaptation=fitting, key=key
+        ).adapted
+    if fitting is not None:
+        return adaptation.adapt(frame, denoiser, adaptation=fitting, key=key).adapted
+    if correction is not None:
         halves_key, fit_key = jax.random.split(key)
         halves = adaptation.split(frame, halves_key)
-        return adaptation.post_correct(halves, denoiser, correction=how, key=fit_key).denoiser
+        return adaptation.post_correct(
+            halves, denoiser, correction=correction, key=fit_key
+        ).denoiser
     return denoiser
 
 

@@ -35,7 +35,7 @@ class Settings:
     )
     combiner: str = NONE  # a name or a file of weights of a deep combiner behind it; or none
     precision: str = "highest"  # of the denoiser's products
-    adaptation: Literal["none", "sure", "post-correct"] = "none"  # of the denoiser to the render
+    adaptation: Literal["none", "sure", "post-correct", "sure-correct"] = "none"  # to the render
     fitting: Adaptation = dataclasses.field(default_factory=Adaptation)
     correction: PostCorrection = dataclasses.field(default_factory=PostCorrection)
     estimator: str = "monte-carlo"  # of the divergence, as `progden denoise --method`; or none
@@ -83,9 +83,11 @@ class Settings:
         """What determines the compiled program that makes these."""
         return (self.denoiser, self.combiner, self.precision, self.method(), self.fit())
 
-    def fit(self) -> Adaptation | PostCorrection | None:
-        """How the denoiser is adapted, if it is."""
-        return {"sure": self.fitting, "post-correct": self.correction}.get(self.adaptation)
+    def fit(self) -> tuple[Adaptation | None, PostCorrection | None]:
+        """How the denoiser is adapted: by SURE, by a correction behind it, by SURE of that, or not at all."""
+        by_sure = self.adaptation in ("sure", "sure-correct")
+        corrected = self.adaptation in ("post-correct", "sure-correct")
+        return self.fitting if by_sure else None, self.correction if corrected else None
 
     def flat(self) -> dict[str, Any]:
         """The settings that matter to this method, by name, the defaults too."""
@@ -106,8 +108,8 @@ class Settings:
         values: dict[str, Any] = {name: getattr(self, name) for name in used}
         mixed, shown = self.image == "mix", self.image != "render"
         relevant = {
-            "adaptation": shown and self.adaptation == "sure",
-            "correction": shown and self.adaptation == "post-correct",
+            "adaptation": shown and self.adaptation in ("sure", "sure-correct"),
+            "correction": shown and self.adaptation in ("post-correct", "sure-correct"),
             "mixer": mixed and self.mixer == CLOSED_FORM,
             "bound": mixed and self.bound,
         }
