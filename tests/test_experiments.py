@@ -28,6 +28,7 @@ from experiments.main_job import plot as main_job
 from experiments.mc_vs_exact import plot as mc_vs_exact
 from experiments.mc_vs_exact import train as mc_vs_exact_train
 from experiments.performance import convolutions, step
+from experiments.performance import denoisers as denoiser_times
 from experiments.performance import run as performance
 from experiments.related_work import limit as related_work_limit
 from experiments.related_work import plot as related_work
@@ -502,6 +503,14 @@ def test_step(command, renders, tmp_path):
     (row,) = cells(printed, "multiscale")
     assert row[1] == f"{found / 1e9:.1f}"
     assert float(row[5]) > 0
+
+
+def test_times_of_denoisers(command, tiny):
+    words = ("--data", DEMO, "--spp", 32, "--size", "20x18")
+    printed = command(denoiser_times, *words, "--denoiser", tiny)
+    first, again = cells(printed, str(tiny))
+    assert (first[1], again[1]) == ("first", "again")
+    assert float(first[2]) >= float(again[2]) >= 0
 
 
 def test_convolutions(command):
