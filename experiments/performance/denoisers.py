@@ -5,22 +5,12 @@
 The frame is made of renders side by side, with albedo and normals.
 """
 
-import time
-from typing import Any
-
-import jax
+import math
 
 import progden_jax as pd
 from experiments import _common
-from experiments.performance.programs import load_frame
-from experiments.performance.run import size_of
-
-
-def seconds(run: Any) -> tuple[float, float]:
-    """Of one call, by the clock and by processor time."""
-    clock, processor = time.perf_counter(), time.process_time()
-    jax.block_until_ready(run())
-    return time.perf_counter() - clock, time.process_time() - processor
+from experiments.performance.programs import FORWARD, Program, load_frame
+from experiments.performance.run import size_of, take_turns
 
 
 def main() -> None:
@@ -35,8 +25,9 @@ def main() -> None:
     rows = []
     for name in arguments.denoiser:
         denoiser = pd.denoisers.load(name)
-        for what in ("first", "again"):
-            clock, processor = seconds(lambda d=denoiser: pd.denoise(frame, d).image)
+        turn = Program(FORWARD, None, name, lambda d=denoiser: pd.denoise(frame, d).image)
+        (times,) = take_turns([turn], rounds=2, budget=math.inf)
+        for what, (clock, processor) in zip(("first", "again"), times, strict=True):
             rows.append((name, what, f"{clock:.1f}", f"{processor:.1f}"))
     print(_common.markdown(("denoiser", "call", "s", "processor s"), rows))
 

@@ -10,8 +10,10 @@ Numbers = tuple[int, ...]
 """Of leaves, in the order of ``jax.tree.leaves``."""
 
 
-def chosen(tree: Any, only: Sequence[str]) -> Numbers:
+def chosen(tree: Any, only: Sequence[str], *, after: Any = None) -> Numbers:
     """The floating-point leaves below layers or attributes of these names; all, if there are no names.
+
+    Numbered as in a tree where those of `after` come first.
 
     Raises
     ------
@@ -21,7 +23,7 @@ def chosen(tree: Any, only: Sequence[str]) -> Numbers:
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
     real = [
         (number, {_name(part) for part in path})
-        for number, (path, leaf) in enumerate(leaves)
+        for number, (path, leaf) in enumerate(leaves, len(jax.tree.leaves(after)))
         if hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, jnp.floating)
     ]
     if not real:

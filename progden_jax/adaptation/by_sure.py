@@ -83,8 +83,7 @@ def adapt_mixer(
     adaptation = Adaptation() if adaptation is None else adaptation
     mix_key, fit_key = jax.random.split(jax.random.key(0) if key is None else key)
     mixed = Mixed(passable(denoiser), mixer, mix_key)
-    before = len(jax.tree.leaves(mixed.denoiser))
-    chosen = tuple(before + number for number in _leaves.chosen(mixer, adaptation.only))
+    chosen = _leaves.chosen(mixer, adaptation.only, after=mixed.denoiser)
     found = fit(frame, mixed, chosen, adaptation, fit_key, progress)
     return found._replace(adapted=found.adapted.mixer)
 
@@ -124,8 +123,7 @@ def correct_by_sure(
     params = _unchanging(correction, start_key) if start is None else correction.checked(start)
     denoiser = passable(denoiser)
     behind = PostCorrected(denoiser, params, {}, correction)
-    before = len(jax.tree.leaves(denoiser))
-    chosen = tuple(before + number for number in _leaves.chosen(params, adaptation.only))
+    chosen = _leaves.chosen(params, adaptation.only, after=denoiser)
     return fit(frame, behind, chosen, adaptation, fit_key, progress, over=denoiser)
 
 

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 NFOR = "nfor"
 
 FITTED_SURE = (
-    "SURE is too low behind a denoiser that was fitted to the same noise: by up to 96 % at 128 samples per "
-    "pixel, where it was measured"
+    "SURE is too low behind a denoiser that was fitted to the same noise: it tells where the image is poor, "
+    "not how good it is"
 )
 
 

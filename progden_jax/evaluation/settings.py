@@ -107,9 +107,10 @@ class Settings:
             used += ["mixer", "bound"]
         values: dict[str, Any] = {name: getattr(self, name) for name in used}
         mixed, shown = self.image == "mix", self.image != "render"
+        fitting, correction = self.fit()
         relevant = {
-            "adaptation": shown and self.adaptation in ("sure", "sure-correct"),
-            "correction": shown and self.adaptation in ("post-correct", "sure-correct"),
+            "adaptation": shown and fitting is not None,
+            "correction": shown and correction is not None,
             "mixer": mixed and self.mixer == CLOSED_FORM,
             "bound": mixed and self.bound,
         }
