@@ -13,12 +13,18 @@ COLORS = {
     "differences": "tab:red",
     "rademacher": "tab:green",
     "probing": "tab:blue",
+    "truncated": "tab:orange",
     "exact": "black",
 }
 TARGETS = {4: 0.38, 16: 0.20, 64: 0.12, 256: 0.06}
-"""Of probing's error over that of differences."""
+"""Of the error over that of as many differences, or, by cones, of the next number of them that is here."""
 
 Row = dict[str, str]
+
+
+def budget(count: int) -> int:
+    """The number of differences that so many passes are compared with."""
+    return min((k for k in TARGETS if k >= count), default=count)
 
 
 def medians(rows: Sequence[Row]) -> dict[tuple[str, str, int], dict[str, float]]:
@@ -29,7 +35,8 @@ def medians(rows: Sequence[Row]) -> dict[tuple[str, str, int], dict[str, float]]
         cell = {name: float(row[name]) for name in ("error", "mean_error", "passes", "seconds")}
         cell["image"], cell["rmse"] = float(row["image"]), abs(float(row["rmse_ratio"]) - 1)
         cell["smape"] = abs(float(row["smape_ratio"]) - 1)
-        other = frames.get((denoiser, scene, spp, "differences", count))
+        compared = budget(count) if method == "truncated" else count
+        other = frames.get((denoiser, scene, spp, "differences", compared))
         cell["ratio"] = float("nan") if other is None else cell["error"] / float(other["error"])
         for name in ("sure", "sure_window", "alpha"):
             cell[name] = float(row[name]) / float(row[f"{name}_exact"])
@@ -58,7 +65,9 @@ def table(rows: Sequence[Row]) -> str:
     }
     lines = []
     for (denoiser, method, count), cell in sorted(medians(rows).items(), key=lambda g: g[0][::2]):
-        target = TARGETS.get(count, "") if method == "probing" else ""
+        target = ""
+        if method in ("probing", "truncated"):
+            target = TARGETS.get(budget(count) if method == "truncated" else count, "")
         values = [float(f"{cell[name]:.3g}") for name in names]
         lines.append((denoiser, method, count, *values, target))
     return _common.markdown(("denoiser", "method", "K", *names.values(), "target"), lines)
@@ -72,7 +81,7 @@ def pareto(rows: Sequence[Row], path: Path) -> None:
     axes = figure.subplots(len(denoisers), 2, squeeze=False)
     for line, denoiser in zip(axes, denoisers, strict=True):
         for axis, cost in zip(line, ("passes", "seconds"), strict=True):
-            for method in ("differences", "rademacher", "probing"):
+            for method in ("differences", "rademacher", "probing", "truncated"):
                 own = [r for r in rows if (r["denoiser"], r["method"]) == (denoiser, method)]
                 points = sorted(
                     (c[cost], c["error"]) for g, c in found.items() if g[:2] == (denoiser, method)
@@ -84,7 +93,8 @@ def pareto(rows: Sequence[Row], path: Path) -> None:
                     color=COLORS[method],
                     alpha=0.25,
                 )
-                axis.plot(*zip(*points, strict=True), "o-", color=COLORS[method], label=method)
+                if points:
+                    axis.plot(*zip(*points, strict=True), "o-", color=COLORS[method], label=method)
             exact = found[denoiser, "exact", 0][cost]
             axis.axvline(exact, color=COLORS["exact"], label="exact, by cones: no error")
             axis.axhline(0.01, color="gray", linewidth=0.8, linestyle=":")

@@ -30,7 +30,15 @@ HERE = Path(__file__).parent
 WINDOW = 15
 """Of the closed form, in pixels; SURE maps are compared after averaging over it, too."""
 
-NAMES = ("exact", "differences", "rademacher", "probing")
+NAMES = ("exact", "differences", "rademacher", "probing", "truncated")
+TRUNCATED = {
+    4: pd.TruncatedCone(levels=1),
+    16: pd.TruncatedCone(levels=2, radius=(1, 1)),
+    26: pd.TruncatedCone(levels=2),
+    81: pd.TruncatedCone(levels=3),
+}
+"""By about how many forward passes they take with OIDN's base network."""
+
 HEADER = (
     *("denoiser", "scene", "spp", "method", "probes", "passes", "seconds"),
     *("error", "mean_error", "sure", "sure_exact", "sure_window", "sure_window_exact"),
@@ -46,11 +54,14 @@ def methods(most: int) -> list[tuple[str, int, pd.Method]]:
             found.append(("differences", count, pd.FiniteDifference(probes=count)))
             found.append(("rademacher", count, pd.MonteCarlo(probes=count)))
             found.append(("probing", count, pd.Probing(probes=count)))
+    found += [("truncated", count, method) for count, method in TRUNCATED.items() if count <= most]
     return found
 
 
 def passes(name: str, count: int, f: Any, x: jax.Array) -> float:
-    """Denoiser passes: the forward one, and one per probe; of the cone what its plan counts."""
+    """Denoiser passes: the forward one, and one per probe; of cones what their plan counts."""
+    if name == "truncated":
+        return 1 + TRUNCATED[count].cost(f)
     return 1 + (pd.Exact().cost(f, x)["cone"] if name == "exact" else count)
 
 

@@ -38,6 +38,9 @@ METHODS = {
     "monte-carlo-gaussian": MethodChoice("MonteCarlo", {"distribution": "gaussian"}),
     "finite-difference": MethodChoice("FiniteDifference"),
     "probing": MethodChoice("Probing"),
+    "cone-1": MethodChoice("TruncatedCone", {"levels": 1}, takes_probes=False),
+    "cone-2": MethodChoice("TruncatedCone", {"levels": 2}, takes_probes=False),
+    "cone-3": MethodChoice("TruncatedCone", {"levels": 3}, takes_probes=False),
     "exact": MethodChoice("Exact", takes_probes=False),
 }
 
@@ -273,7 +276,7 @@ class EstimateOptions:
         if self.probes is not None and self.probes < 1:
             raise UsageError(f"--probes is {self.probes}, expected at least 1.")
         if self.probes and self.method and not METHODS[self.method].takes_probes:
-            raise UsageError(f"--method {self.method} is exact and takes no --probes.")
+            raise UsageError(f"--method {self.method} takes no --probes.")
         if not 0 <= self.seed < 2**32:
             raise UsageError(f"--seed is {self.seed}, expected 0 to {2**32 - 1}.")
         if self.mixer is not None:
@@ -287,7 +290,7 @@ class EstimateOptions:
     @property
     def exact(self) -> bool:
         """Whether the divergence is to be exact, which may take an hour."""
-        return self.method is not None and not METHODS[self.method].takes_probes
+        return self.method is not None and METHODS[self.method].type == "Exact"
 
     def build(self) -> "Method":
         """The estimator."""

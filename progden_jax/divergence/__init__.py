@@ -14,6 +14,7 @@ from progden_jax.divergence.exact import Exact
 from progden_jax.divergence.monte_carlo import FiniteDifference, MonteCarlo
 from progden_jax.divergence.probing import Probing
 from progden_jax.divergence.running import exact_divergence
+from progden_jax.divergence.truncated import TruncatedCone
 
 __all__ = [
     "DivergenceEstimate",
@@ -24,6 +25,7 @@ __all__ = [
     "Method",
     "MonteCarlo",
     "Probing",
+    "TruncatedCone",
     "divergence",
     "divergence_and_error",
     "evaluate",

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import logging
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -92,7 +93,7 @@ class Exact:
         del key, origin
         algorithm = self.choose(f, x)
         if algorithm == "cone":
-            value, diagonal = self._by_cone(f, x)
+            value, diagonal = by_cone(f, x, self.chunk)
         else:
             value, tangent = jax.linearize(f, x)
             colors = self.colors(f, x, algorithm)
@@ -125,8 +126,7 @@ class Exact:
             costs["coloring"] = float(self.colors(f, x, "coloring").max() + 1)
         if hasattr(f, "layered"):
             nodes, params = f.layers  # pyright: ignore[reportFunctionMemberAccess]
-            plan = windows.plan(nodes, params)
-            costs["cone"] = windows.multiply_adds(plan, params) / graph.multiply_adds(nodes, params)
+            costs["cone"] = cone_cost(nodes, params)
         return costs
 
     def colors(self, f: Function, x: Float[Array, "h w 3"], algorithm: str) -> np.ndarray:
@@ -153,29 +153,43 @@ class Exact:
         period = -(-(radius + 1) // alignment) * alignment
         return period, period
 
-    def _by_cone(self, f: Function, x: Array) -> tuple[Array, Array]:
-        check_layered(f)
-        layered: graph.Layered = f.layered(x)  # pyright: ignore[reportFunctionMemberAccess]
-        value, slope, kept = cone_primal(layered, x)
-        diagonal = cone.jacobian_diagonal(
-            windows.plan(layered.nodes, layered.params),
-            layered.params,
-            kept,
-            (layered.inputs.shape[0], layered.inputs.shape[1]),
-            chunk=self.chunk or cone_chunk(),
-            precision=lax.Precision.HIGHEST,
-        )
-        return value, slope * diagonal[: x.shape[0], : x.shape[1]]
-
 
 def check_layered(f: Function) -> None:
     """Raise unless f shows its layers."""
     if not hasattr(f, "layered"):
         raise ValueError(
-            f"algorithm is 'cone', which looks inside the network, and f, a {type(f).__name__}, does "
-            "not show its layers: bind one of progden_jax's denoisers, give f `layers` and `layered` "
-            "(see progden_jax.denoisers.graph), or use algorithm='basis' or 'coloring'."
+            f"cones look inside the network, and f, a {type(f).__name__}, does not show its layers: bind one "
+            "of progden_jax's denoisers, give f `layers` and `layered` (see progden_jax.denoisers.graph), "
+            "or use Exact('basis') or Exact('coloring')."
         )
+
+
+def by_cone(f: Function, x: Array, chunk: int | None = None, **limits: Any) -> tuple[Array, Array]:
+    """f(x) and ∂f/∂x at every pixel and channel, by windows within the `limits` of `windows.plan`.
+
+    Raises
+    ------
+    ValueError
+        If f shows no layers.
+    """
+    check_layered(f)
+    layered: graph.Layered = f.layered(x)  # pyright: ignore[reportFunctionMemberAccess]
+    value, slope, kept = cone_primal(layered, x)
+    diagonal = cone.jacobian_diagonal(
+        windows.plan(layered.nodes, layered.params, **limits),
+        layered.params,
+        kept,
+        (layered.inputs.shape[0], layered.inputs.shape[1]),
+        chunk=chunk or cone_chunk(),
+        precision=lax.Precision.HIGHEST,
+    )
+    return value, slope * diagonal[: x.shape[0], : x.shape[1]]
+
+
+def cone_cost(nodes: Sequence[graph.Node], params: Any, **limits: Any) -> float:
+    """Multiply-adds of the windows within the `limits` of `windows.plan`, in forward passes."""
+    plan = windows.plan(nodes, params, **limits)
+    return windows.multiply_adds(plan, params) / graph.multiply_adds(nodes, params)
 
 
 def cone_chunk() -> int:

@@ -30,22 +30,37 @@ class Plan:
     @property
     def period(self) -> int:
         """Pixels after which the windows repeat."""
-        return 1 << max(self.levels)
+        used = zip(self.levels, self.windows, strict=True)
+        return 1 << max(level for level, window in used if window is not None)
 
 
-def plan(nodes: Sequence[g.Node], params: Any) -> Plan:
+def plan(
+    nodes: Sequence[g.Node],
+    params: Any,
+    *,
+    levels: int | None = None,
+    radius: int | tuple[int, ...] | None = None,
+) -> Plan:
     """The windows of every node: forward cone of one input pixel, met with its backward cone.
 
     Both are intervals per axis and phase. Convolutions widen them, pooling and upsampling halve
     and double the positions, rounding as the phase has it.
+
+    Given `levels`, as many from the finest on have windows and the rest none. Given `radius`, windows end
+    that many of their pixels from the one above p: of each level from the finest on, or, if it is one
+    number, of the coarsest.
     """
-    levels = g.levels(nodes)
-    phases = np.arange(1 << max(levels))
+    depths = g.levels(nodes)
+    coarsest = max(depths) if levels is None else min(levels - 1, max(depths))
+    phases = np.arange(1 << coarsest)
+    ends = dict(enumerate(radius)) if isinstance(radius, tuple) else {coarsest: radius}
     # Absolute positions, for a pixel p equal to its phase plus a multiple of every stride.
     forward: list[np.ndarray | None] = []
-    for node in nodes:
+    for level, node in zip(depths, nodes, strict=True):
         spans = [forward[s] for s in g.sources(node)]
         match node:
+            case _ if level > coarsest:
+                span = None
             case g.Input():
                 span = np.stack([phases, phases])
             case g.Conv():
@@ -61,6 +76,10 @@ def plan(nodes: Sequence[g.Node], params: Any) -> Plan:
                 span = _union([reached, forward[node.logits]])
             case _:
                 span = _union(spans)
+        end = ends.get(level)
+        if span is not None and end is not None:
+            above = phases >> level
+            span = np.stack([np.maximum(span[0], above - end), np.minimum(span[1], above + end)])
         forward.append(span)
 
     backward: list[np.ndarray | None] = [None] * len(nodes)
@@ -87,7 +106,7 @@ def plan(nodes: Sequence[g.Node], params: Any) -> Plan:
             backward[source] = _union([backward[source], needed])
 
     windows: list[Window | None] = []
-    for level, ahead, behind in zip(levels, forward, backward, strict=True):
+    for level, ahead, behind in zip(depths, forward, backward, strict=True):
         if ahead is None or behind is None:
             windows.append(None)
             continue
@@ -98,7 +117,7 @@ def plan(nodes: Sequence[g.Node], params: Any) -> Plan:
         if (high - size + 1).max() <= low.min():
             low = np.full_like(low, low.min())
         windows.append(Window(low, size) if size > 0 else None)
-    return Plan(tuple(nodes), tuple(levels), tuple(windows))
+    return Plan(tuple(nodes), tuple(depths), tuple(windows))
 
 
 def _radius(params: Any, node: g.Conv) -> int:

@@ -12,7 +12,7 @@ from progden_jax.divergence import FiniteDifference, Method
 from progden_jax.mixers import CLOSED_FORM
 from progden_jax.mixing import ClosedForm
 from progden_jax.training import config
-from progden_jax.training.mixer_task import METHODS
+from progden_jax.training.mixer_task import METHODS, WITHOUT_PROBES
 from progden_jax.tstatistic import Bound
 
 AUTO = "auto"
@@ -98,7 +98,7 @@ class Settings:
                 used.append("combiner")
             # Runs from before there was any stay as they are.
             used += ["adaptation"] if self.adaptation != NONE else []
-            probed = self.estimator not in (NONE, "exact")
+            probed = self.estimator not in (NONE, *WITHOUT_PROBES)
             used += ["probes"] if probed else []
             used += ["seed"] if probed or self.adaptation != NONE else []
             if self.estimator == "finite-difference":

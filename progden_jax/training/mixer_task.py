@@ -10,7 +10,14 @@ from jaxtyping import Array, Float
 
 from progden_jax import denoisers
 from progden_jax.denoisers import OIDN, Denoiser
-from progden_jax.divergence import Exact, FiniteDifference, Method, MonteCarlo, Probing
+from progden_jax.divergence import (
+    Exact,
+    FiniteDifference,
+    Method,
+    MonteCarlo,
+    Probing,
+    TruncatedCone,
+)
 from progden_jax.mixers import NetworkMixer, build, save_mixer
 from progden_jax.mixers.architectures import Architecture, Params
 from progden_jax.sure import sure
@@ -24,9 +31,15 @@ METHODS = {
     "monte-carlo-gaussian": lambda probes: MonteCarlo(probes, "gaussian"),
     "finite-difference": FiniteDifference,
     "probing": Probing,
+    "cone-1": lambda _: TruncatedCone(1),
+    "cone-2": lambda _: TruncatedCone(2),
+    "cone-3": lambda _: TruncatedCone(3),
     "exact": lambda _: Exact(),
 }
-"""Estimators by the names that `progden denoise --method` has for them."""
+"""Estimators by the names that `progden denoise --method` has for them, of a number of probes."""
+
+WITHOUT_PROBES = ("cone-1", "cone-2", "cone-3", "exact")
+"""Those that take none, and no random numbers."""
 
 
 class MixerTask:
