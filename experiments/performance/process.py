@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from progden_jax.memory import parse_size
+
 FRAME, DENOISER, MIXER = "frame.npz", "denoiser.npz", "mixer.npz"
 MIXER_FILE = "mixer.safetensors"
 
@@ -51,7 +53,7 @@ def forget_peak() -> None:
 Run = Callable[[dict[str, np.ndarray]], Any]
 
 
-def ours(folder: Path, denoiser: str, probes: int) -> Run:
+def ours(folder: Path, denoiser: str, probes: int, max_memory: int | None = None) -> Run:
     import jax
 
     import progden_jax as pd
@@ -62,7 +64,9 @@ def ours(folder: Path, denoiser: str, probes: int) -> Run:
 
     def run(buffers: dict[str, np.ndarray]) -> Any:
         frame = pd.Frame(**buffers)
-        result = pd.progressive_denoise(frame, network, mixer=mixer, method=method)
+        result = pd.progressive_denoise(
+            frame, network, mixer=mixer, method=method, max_memory=max_memory
+        )
         return np.asarray(jax.block_until_ready(result.image))
 
     return run
@@ -92,7 +96,11 @@ def pytorch(folder: Path, denoiser: str, probes: int) -> Run:
     return run
 
 
-PROGRAMS = {"progden_jax": ours, "native OIDN": native, "PyTorch": pytorch}
+PROGRAMS: dict[str, Callable[..., Run]] = {
+    "progden_jax": ours,
+    "native OIDN": native,
+    "PyTorch": pytorch,
+}
 
 
 class Compilations:
@@ -119,12 +127,16 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--denoiser", default="oidn-hdr")
     parser.add_argument("--probes", type=int, default=4)
+    parser.add_argument("--max-memory", help="progden_jax's, such as 2GiB")
     parser.add_argument("--began", type=float, help="time.time() when it was started")
     arguments = parser.parse_args()
     with np.load(arguments.folder / FRAME) as arrays:
         buffers = {name: arrays[name] for name in arrays.files}
     smaller = {name: np.ascontiguousarray(b[:-8, :-8]) for name, b in buffers.items()}
-    run = PROGRAMS[arguments.program](arguments.folder, arguments.denoiser, arguments.probes)
+    bound = {"max_memory": parse_size(arguments.max_memory)} if arguments.max_memory else {}
+    run = PROGRAMS[arguments.program](
+        arguments.folder, arguments.denoiser, arguments.probes, **bound
+    )
     compilations = Compilations()
     ready = time.time() - arguments.began
     forget_peak()

@@ -88,6 +88,7 @@ class Process(NamedTuple):
 
     size: str
     program: str
+    max_memory: str
     cache: str
     ready_s: float
     first_result_s: float
@@ -197,9 +198,17 @@ def errors(
 
 
 def processes(
-    size: str, scene: Scene, denoiser: str, probes: int, names: Sequence[str]
+    size: str,
+    scene: Scene,
+    denoiser: str,
+    probes: int,
+    names: Sequence[str],
+    bounds: Sequence[str] = (),
 ) -> list[Process]:
-    """Each program in a process of its own, this project's with an empty cache and with a filled one."""
+    """Each program in a process of its own, this project's with an empty cache and with a filled one.
+
+    This project's with each `max_memory` of `bounds`, too.
+    """
     found = []
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
@@ -208,8 +217,13 @@ def processes(
         process.save_params(folder / process.MIXER, scene.paper.params)
         mixers.save_mixer(folder / process.MIXER_FILE, scene.paper)
         for name in names:
-            for cache in ("empty", "filled") if name == OURS else ("",):
+            turns = [("", "")]
+            if name == OURS:
+                turns = [("empty", ""), ("filled", "")]
+                turns += [(cache, bound) for bound in bounds for cache in ("empty", "filled")]
+            for cache, bound in turns:
                 words = [name, str(folder), "--denoiser", denoiser, "--probes", str(probes)]
+                words += ["--max-memory", bound] if bound else []
                 printed = subprocess.run(
                     [sys.executable, "-m", process.__name__, *words, "--began", str(time.time())],
                     env=os.environ | {"PROGDEN_CACHE": str(folder / "cache")},
@@ -218,7 +232,7 @@ def processes(
                     check=True,
                 ).stdout
                 values = json.loads(printed)
-                found.append(Process(size, name, cache, **values))
+                found.append(Process(size, name, bound, cache, **values))
     return found
 
 
@@ -293,7 +307,15 @@ def tables(rows: Sequence[Row], off: Sequence[Error], found: Sequence[Process]) 
         text.append(_common.markdown(header, ((*e[:3], f"{e.ms:.1f}", *e[4:]) for e in off)))
     if found:
         header = (
-            *("size", "program", "cache", "imports and loading, s", "first result, s", "again, s"),
+            *(
+                "size",
+                "program",
+                "max_memory",
+                "cache",
+                "imports and loading, s",
+                "first result, s",
+                "again, s",
+            ),
             *("programs", "compiled", "programs, again", "8 pixels smaller", "peak, MB"),
         )
         text.append(_common.markdown(header, found))
