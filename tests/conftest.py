@@ -1,6 +1,7 @@
 """What many tests share: real frames, small random images, and counts of compilations."""
 
 import functools
+import gc
 import os
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,6 +18,15 @@ from progden_jax.compilation import counting_compilations as counting_compilatio
 from progden_jax.denoisers import unet
 
 DEMO = Path(pd.__file__).parent / "data" / "demo"
+
+# Next to nothing of what is imported for the tests is garbage, and looking takes seconds.
+gc.disable()
+
+
+def pytest_collection_finish():
+    gc.freeze()
+    gc.enable()
+
 
 # XLA reads its flags when it first compiles; workers have them from the process that started them.
 if "PYTEST_XDIST_WORKER" not in os.environ:

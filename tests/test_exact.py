@@ -54,10 +54,8 @@ class Network:
                 taken = sum(channels[s] for s in node.sources)
                 size, width = sizes[node.layer], widths[node.layer]
                 self.params[node.layer] = {
-                    "kernel": jnp.asarray(
-                        rng.normal(size=(size, size, taken, width)) / np.sqrt(taken * size)
-                    ),
-                    "bias": jnp.asarray(0.1 * rng.normal(size=width)),
+                    "kernel": rng.normal(size=(size, size, taken, width)) / np.sqrt(taken * size),
+                    "bias": 0.1 * rng.normal(size=width),
                 }
                 channels[index] = width
             elif isinstance(node, Pointwise) and node.channels:
@@ -65,13 +63,11 @@ class Network:
             else:
                 channels[index] = width = channels[graph.sources(node)[0]]
                 if isinstance(node, LeakyRelu):
-                    self.params[node.layer] = {"slope": jnp.asarray(rng.uniform(-0.5, 0.5, width))}
+                    self.params[node.layer] = {"slope": rng.uniform(-0.5, 0.5, width)}
                 if isinstance(node, Affine):
                     scale, shift = rng.normal(1, 0.3, width), rng.normal(size=width)
-                    self.params[node.layer] = {
-                        "scale": jnp.asarray(scale),
-                        "shift": jnp.asarray(shift),
-                    }
+                    self.params[node.layer] = {"scale": scale, "shift": shift}
+        self.params = jax.tree.map(np.float32, self.params)
         self.alignment = 1 << max(graph.levels(nodes))
         self.auxiliary = auxiliary
 

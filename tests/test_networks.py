@@ -1,5 +1,7 @@
 """The project's own denoisers: what they see, what they give, their derivatives, and their files."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,10 +23,12 @@ def tiny_kpcn(inputs=(), **settings) -> KPCN:
     return KPCN({**net.params, "kernel": last}, inputs)
 
 
-NETWORKS = {
-    "unet": UNet.init(jax.random.key(0), EVERYTHING, size="small"),
-    "kpcn": tiny_kpcn(EVERYTHING),
-}
+@functools.cache
+def network(kind: str) -> pd.Denoiser:
+    """That takes every input."""
+    if kind == "kpcn":
+        return tiny_kpcn(EVERYTHING)
+    return UNet.init(jax.random.key(0), EVERYTHING, size="small")
 
 
 @pytest.fixture(scope="module")
@@ -34,9 +38,9 @@ def frame(real_frame):
     )
 
 
-@pytest.fixture(params=list(NETWORKS))
+@pytest.fixture(params=["unet", "kpcn"])
 def denoiser(request):
-    return NETWORKS[request.param]
+    return network(request.param)
 
 
 def cut(frame, height, width):
@@ -62,7 +66,7 @@ def test_what_the_networks_see(frame):
     color = np.array(frame.color)
     color[0, 0], color[0, 1, 0], color[0, 2] = np.nan, -2.0, 1e6
     frame = frame.replace(color=color)
-    shown = NETWORKS["unet"].bind(frame).layered(frame.color)
+    shown = network("unet").bind(frame).layered(frame.color)
     sane = np.nan_to_num(np.maximum(color, 0)).astype(np.float64)
     expected = [
         np.log1p(sane) / np.log(65505),
@@ -95,7 +99,7 @@ def test_any_size_and_canvas(frame, denoiser):
 
 
 def test_pipeline_eager_is_jitted(frame):
-    frame, denoiser = cut(frame, 5, 11), NETWORKS["kpcn"]
+    frame, denoiser = cut(frame, 5, 11), network("kpcn")
     eager = pd.progressive_denoise(frame, denoiser)
     jitted = jax.jit(pd.progressive_denoise)(frame, denoiser)
     for name in ("image", "alpha", "denoised", "divergence"):
@@ -152,14 +156,14 @@ def test_every_divergence_method_on_kpcn(frame):
 
 def test_what_the_divergence_of_a_unet_looks_into():
     """Its layers are OIDN's, whose cones are tested."""
-    ours, theirs = NETWORKS["unet"], pd.denoisers.load("oidn-hdr-small")
+    ours, theirs = network("unet"), pd.denoisers.load("oidn-hdr-small")
     assert ours.nodes == theirs.nodes
     assert ours.receptive_radius == theirs.receptive_radius == 94
     assert graph.alignment(ours.nodes) == 16
 
 
 def test_the_variance_is_an_input(frame):
-    frame, net = cut(frame, 5, 11), NETWORKS["kpcn"]
+    frame, net = cut(frame, 5, 11), network("kpcn")
     other = frame.replace(variance=100 * frame.variance + 1)
     assert np.abs(net(frame) - net(other)).max() > 1e-4
 
@@ -187,7 +191,7 @@ def test_kpcn_filters_linear_radiance_inside_the_image(frame):
 
 
 def test_files_round_trip(tmp_path, frame, monkeypatch):
-    net = NETWORKS["kpcn"]
+    net = network("kpcn")
     pd.denoisers.save(tmp_path / "a.safetensors", net, dtype="float32", metadata={"seed": "1"})
     again = pd.denoisers.load(tmp_path / "a.safetensors")
     assert isinstance(again, KPCN)
@@ -209,8 +213,8 @@ def test_files_round_trip(tmp_path, frame, monkeypatch):
     assert "a" not in pd.denoisers.names()
     shipped = pd.denoisers.load("unet-hdr-var")
     assert (shipped.name, shipped.inputs) == ("unet-hdr-var", ("variance",))
-    halves = jax.tree.map(lambda a: np.asarray(a, np.float16), NETWORKS["unet"].params)
-    pd.denoisers.save(tmp_path / "b.safetensors", NETWORKS["unet"])
+    halves = jax.tree.map(lambda a: np.asarray(a, np.float16), network("unet").params)
+    pd.denoisers.save(tmp_path / "b.safetensors", network("unet"))
     read = pd.denoisers.load(tmp_path / "b.safetensors").params
     jax.tree.map(np.testing.assert_array_equal, read, halves)
     assert jax.tree.leaves(read)[0].dtype == np.float32
@@ -228,9 +232,9 @@ def test_weights_as_an_archive(tmp_path):
     np.testing.assert_array_equal(kernel.transpose(2, 3, 1, 0), net.params["enc_conv0"]["kernel"])
     assert pd.denoisers.load(tmp_path / "u.tza").inputs == ("albedo", "normal")
     with pytest.raises(ValueError, match="takes albedo and normal and variance besides the colour"):
-        pd.denoisers.save_tza(tmp_path / "v.tza", NETWORKS["unet"])
+        pd.denoisers.save_tza(tmp_path / "v.tza", network("unet"))
     with pytest.raises(ValueError, match="the denoiser is a KPCN; a .tza file holds OIDN's U-Net"):
-        pd.denoisers.save_tza(tmp_path / "k.tza", NETWORKS["kpcn"])
+        pd.denoisers.save_tza(tmp_path / "k.tza", network("kpcn"))
     assert [p.name for p in tmp_path.iterdir()] == ["u.tza"]
 
 
