@@ -20,14 +20,20 @@ from progden_jax.divergence.probing import MOST_PROBES, SCALES, colors, deflated
 SIZE = (12, 14, 3)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def x():
     return jnp.asarray(np.random.default_rng(0).gamma(2.0, 0.5, SIZE), jnp.float32)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def variance(x):
     return 0.01 * x**2
+
+
+@pytest.fixture(scope="module")
+def diagonal(x):
+    """∂f/∂x of `near`."""
+    return dense_jacobian_diagonal(near, np.asarray(x))
 
 
 def of_crop(frame, row, column, size):
@@ -92,7 +98,7 @@ def test_colors_belong_to_positions():
     assert len(np.unique(lattice(64, 64))) == MOST_PROBES
 
 
-@pytest.mark.parametrize("probes", [1, 2, 3, 7, 16, 100])
+@pytest.mark.parametrize("probes", [1, 7, 100])
 @pytest.mark.parametrize("scale", SCALES)
 def test_exact_for_pointwise_functions(probes, scale, x, variance):
     found = divergence(lambda x: x**2, x, variance, method=pd.Probing(probes=probes, scale=scale))
@@ -100,16 +106,15 @@ def test_exact_for_pointwise_functions(probes, scale, x, variance):
 
 
 @pytest.mark.parametrize("scale", SCALES)
-def test_exact_for_a_local_filter_once_its_footprint_is_covered(scale, x, variance):
-    truth = np.asarray(variance) * dense_jacobian_diagonal(near, np.asarray(x))
+def test_exact_for_a_local_filter_once_its_footprint_is_covered(scale, x, variance, diagonal):
+    truth = np.asarray(variance) * diagonal
     errors = {}
-    for count in (8, 16, 64):
+    for count in (8, 16):
         found = divergence(near, x, variance, method=pd.Probing(probes=count, scale=scale))
         errors[count] = np.abs(np.asarray(found) - truth).max() / np.abs(truth).max()
     # The 27 values that a 3×3 filter sees hold no second one of the own colour out of 16.
     assert errors[8] > 1e-2
     assert errors[16] < 1e-5
-    assert errors[64] < 1e-5
 
 
 def test_nested(x, variance):
@@ -119,7 +124,7 @@ def test_nested(x, variance):
     weight = sigma * (np.abs(np.asarray(jax.jit(near)(x))) + sigma / 10)
     b = weight * np.asarray(_random.signs(key, 0, x)) * patterns(11, lattice(*SIZE[:2]))
     contributions = sigma**2 / weight**2 * b * np.asarray(jax.jit(jax.vmap(near))(b))
-    for count in (1, 2, 3, 8, 11):
+    for count in (1, 3, 11):
         found = divergence(near, x, variance, method=pd.Probing(probes=count), key=key)
         expected = np.mean(contributions[:count], axis=0)
         np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(contributions[0]).max())
@@ -135,8 +140,8 @@ def for_each(keys, x, variance, method):
     return np.asarray(run(keys), np.float64)
 
 
-def test_unbiased_at_every_number_of_probes(x, variance):
-    truth = np.asarray(variance) * dense_jacobian_diagonal(near, np.asarray(x))
+def test_unbiased_at_every_number_of_probes(x, variance, diagonal):
+    truth = np.asarray(variance) * diagonal
     keys = jax.random.split(jax.random.key(4), 600)
     for count, scale in ((1, "radiance"), (3, "sigma"), (3, "unit"), (11, "radiance")):
         found = for_each(keys, x, variance, pd.Probing(probes=count, scale=scale))
@@ -151,7 +156,7 @@ def test_variance_is_the_closed_form(x, variance):
     value, sigma2 = np.asarray(jax.jit(near)(x)).ravel(), np.asarray(variance).ravel()
     weight = np.sqrt(sigma2) * (np.abs(value) + np.sqrt(sigma2) / 10)
     keys = jax.random.split(jax.random.key(5), 2000)
-    for count in (2, 5, 8):
+    for count in (5, 8):
         table = np.asarray(patterns(count, lattice(*SIZE[:2]))).reshape(count, n)
         mixing = table.T @ table / count
         terms = jacobian * mixing * weight[None]
@@ -174,7 +179,7 @@ def loud(variance):
 set_apart = jax.jit(deflated, static_argnums=1)
 
 
-def test_outliers_get_probes_of_their_own(x, loud):
+def test_outliers_get_probes_of_their_own(x, loud, diagonal):
     variance, where = loud
     for probes, expected in ((3, 0), (16, 3)):
         index, number = set_apart(variance, probes)
@@ -182,7 +187,7 @@ def test_outliers_get_probes_of_their_own(x, loud):
         assert number == expected
     assert set(np.asarray(index)[:3]) == set(np.flatnonzero(where))
     found = divergence(near, x, variance, method=pd.Probing(probes=16))
-    truth = np.asarray(variance) * dense_jacobian_diagonal(near, np.asarray(x))
+    truth = np.asarray(variance) * diagonal
     found = np.asarray(found)
     np.testing.assert_allclose(found[where], truth[where], rtol=1e-5)
     quiet = np.where(where, 0, variance)
@@ -195,9 +200,9 @@ def test_without_outliers_no_probe_is_spent_on_one_value(variance):
         assert set_apart(each, 64)[1] == 0
 
 
-def test_unbiased_beside_outliers(x, loud):
+def test_unbiased_beside_outliers(x, loud, diagonal):
     variance, where = loud
-    truth = np.asarray(variance) * dense_jacobian_diagonal(near, np.asarray(x))
+    truth = np.asarray(variance) * diagonal
     keys = jax.random.split(jax.random.key(4), 600)
     found = for_each(keys, x, variance, pd.Probing(probes=12))
     error = found.std(0, ddof=1) / np.sqrt(len(keys))
@@ -235,7 +240,7 @@ def test_a_firefly_does_not_drown_the_other_pixels(real_frame):
             method = pd.Probing(probes=probes)
             found = [
                 pd.divergence(f, frame.color, frame.variance, method=method, key=key)
-                for key in jax.random.split(jax.random.key(9), 5)
+                for key in jax.random.split(jax.random.key(9), 3)
             ]
             found = [np.asarray(d).ravel()[places] for d in found]
             errors[name, probes] = np.median([relative_rmse(d, truth) for d in found])
@@ -247,7 +252,7 @@ def relative_rmse(found, truth):
     return float(np.sqrt(((np.asarray(found, np.float64) - truth) ** 2).mean() / (truth**2).mean()))
 
 
-@pytest.mark.parametrize(("probes", "share"), [(4, 0.8), (64, 0.4)])
+@pytest.mark.parametrize(("probes", "share"), [(4, 0.8), (16, 0.4)])
 def test_less_error_than_random_probes_on_a_network(probes, share, small):
     f, frame, truth = small
     errors = [
@@ -256,7 +261,7 @@ def test_less_error_than_random_probes_on_a_network(probes, share, small):
                 relative_rmse(
                     pd.divergence(f, frame.color, frame.variance, method=method, key=key), truth
                 )
-                for key in jax.random.split(jax.random.key(6), 5)
+                for key in jax.random.split(jax.random.key(6), 3)
             ]
         )
         for method in (pd.Probing(probes=probes), pd.MonteCarlo(probes=probes))
@@ -334,7 +339,7 @@ def test_tolerance_is_kept(small):
     tolerance = 0.08
     method = pd.Probing(tolerance=tolerance, probes=128, tile=8)
     shares = []
-    for key in jax.random.split(jax.random.key(8), 8):
+    for key in jax.random.split(jax.random.key(8), 4):
         found = evaluate(f, frame.color, frame.variance, method=method, key=key)
         sure = np.asarray((found.value - frame.color) ** 2 - frame.variance)
         for tile, spent in zip(TILES, np.asarray(found.probes).ravel(), strict=True):
@@ -342,7 +347,7 @@ def test_tolerance_is_kept(small):
             if spent < 128:
                 exact = (sure + 2 * truth)[tile].mean()
                 shares.append((sure + 2 * found.divergence)[tile].mean() / exact - 1)
-    assert len(shares) >= 24
+    assert len(shares) >= 12
     assert np.sqrt(np.mean(np.square(shares))) < tolerance
     assert np.abs(shares).max() < 4 * tolerance
 
@@ -364,17 +369,17 @@ def test_padding_changes_nothing(real_frame, near_sighted):
     np.testing.assert_allclose(padded, plain, rtol=1e-3, atol=1e-5 * np.abs(plain).max())
 
 
-@pytest.mark.parametrize("scale", [1e-6, 1e6])
-def test_does_not_depend_on_the_scale_of_radiance(scale, x, variance):
+def test_does_not_depend_on_the_scale_of_radiance(x, variance):
     def f(x):  # homogeneous of degree 1
         return jnp.sqrt(near(x) ** 2 + x**2)
 
     method = pd.Probing(probes=8)
     expected = divergence(f, x, variance, method=method)
-    scaled = np.asarray(divergence(f, scale * x, scale**2 * variance, method=method))
-    np.testing.assert_allclose(
-        scaled / scale**2, expected, rtol=1e-3, atol=1e-5 * np.abs(expected).max()
-    )
+    for scale in (1e-6, 1e6):
+        scaled = np.asarray(divergence(f, scale * x, scale**2 * variance, method=method))
+        np.testing.assert_allclose(
+            scaled / scale**2, expected, rtol=1e-3, atol=1e-5 * np.abs(expected).max()
+        )
 
 
 def test_every_number_of_probes_is_taken_and_compiles_once(x, variance):
