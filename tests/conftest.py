@@ -19,6 +19,9 @@ from progden_jax.denoisers import unet
 
 DEMO = Path(pd.__file__).parent / "data" / "demo"
 
+# `metrics.flip` sets it too, but too late where a test imports FLIP first: its threads spin for 0.1 s a call.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
 # Next to nothing of what is imported for the tests is garbage, and looking takes seconds.
 gc.disable()
 

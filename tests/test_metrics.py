@@ -93,9 +93,10 @@ def test_equals_dense_reference(name, shape):
 
 @pytest.mark.parametrize("name", TRACED)
 def test_eager_equals_compiled(name):
-    value = TRACED[name](*noisy_pair())
+    pair = noisy_pair((5, 6, 3))
+    value = TRACED[name](*pair)
     assert value.dtype == jnp.float32
-    np.testing.assert_allclose(float(value), float(JITTED[name](*noisy_pair())), rtol=5e-6)
+    np.testing.assert_allclose(float(value), float(JITTED[name](*pair)), rtol=5e-6)
 
 
 @pytest.mark.parametrize("name", TRACED)
@@ -190,20 +191,20 @@ FLAT = {
 }
 
 
-@pytest.mark.parametrize("size", [(12, 12, 3), (1, 1, 3), (1, 5, 3)])
+@pytest.mark.parametrize("size", [(4, 5, 3), (1, 1, 3), (1, 5, 3)])
 @pytest.mark.parametrize(("image", "reference"), FLAT.values(), ids=FLAT)
 @pytest.mark.parametrize("name", TRACED)
 def test_gradients_are_finite_on_flat_images(name, image, reference, size):
     pair = jnp.full(size, image, jnp.float32), jnp.full(size, reference, jnp.float32)
     value, gradients = SLOPES[name](*pair)
-    assert jnp.isfinite(value)
+    assert np.isfinite(value)
     for gradient in gradients:
-        assert jnp.isfinite(gradient).all()
+        assert np.isfinite(gradient).all()
 
 
 @pytest.mark.parametrize("name", TRACED)
 def test_gradients_match_differences(name):
-    image, reference = noisy_pair((11, 12, 3), seed=4, dtype=np.float64)
+    image, reference = noisy_pair((7, 8, 3), seed=4, dtype=np.float64)
     direction = np.random.default_rng(1).normal(size=image.shape)
     image = np.abs(image) + 0.05  # away from the kinks of |z| and of the clamp at zero
     step = 1e-6
@@ -218,7 +219,8 @@ def test_gradients_match_differences(name):
 
 def test_rmse_gradient_is_zero_at_equality():
     image, _ = noisy_pair()
-    assert not jax.grad(metrics.rmse)(jnp.asarray(image), jnp.asarray(image)).any()
+    for gradient in SLOPES["rmse"](image, image)[1]:
+        assert not np.asarray(gradient).any()
 
 
 def test_nan_is_not_hidden():
@@ -236,11 +238,11 @@ def test_ssim_equals_dm_pix_with_its_own_window():
 
 def test_tone_map_stays_on_the_display():
     radiance = jnp.array([-1.0, 0.0, 1e-6, 0.003, 1.0, 1e6], jnp.float32)
-    shown = metrics.tone_map(radiance)
+    shown = jax.jit(metrics.tone_map)(radiance)
     np.testing.assert_allclose(shown, display(np.asarray(radiance, np.float64)), atol=2e-7)
     assert shown.min() == 0
     assert shown.max() <= 1
-    assert jnp.isfinite(jax.vmap(jax.grad(metrics.tone_map))(radiance)).all()
+    assert np.isfinite(jax.jit(jax.vmap(jax.grad(metrics.tone_map)))(radiance)).all()
 
 
 def test_flip_is_nvidias_with_the_reference_first():

@@ -190,7 +190,8 @@ def test_gradient_of_the_compiled_closed_form(confidence):
 
     def total(s, x, y, variance, divergence, direction):
         y = y + s * direction
-        return pd.closed_form_alpha(x, y, variance, divergence, confidence=confidence).sum()
+        settings = {"confidence": confidence, "window": 7}
+        return pd.closed_form_alpha(x, y, variance, divergence, **settings).sum()
 
     @jax.jit
     def both(s, *arrays):
