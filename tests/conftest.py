@@ -38,8 +38,8 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
 
 @pytest.fixture(scope="session")
 def real_frame() -> pd.Frame:
-    """A 128×128 render at 8 samples per pixel, all buffers."""
-    return pd.read_exr(sorted(DEMO.glob("*_000008spp.exr"))[0])
+    """A 128×128 render at 8 samples per pixel, all buffers in NumPy: parts of them are no programs of JAX."""
+    return jax.tree.map(np.asarray, pd.read_exr(sorted(DEMO.glob("*_000008spp.exr"))[0]))
 
 
 @pytest.fixture(scope="session")

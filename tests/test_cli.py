@@ -180,7 +180,8 @@ def test_flags_parse_in_any_order():
         ["--save", "alpha,sure"],
         ["--json"],
     ]
-    for order in itertools.permutations(groups):
+    # Each group is last once, and first.
+    for order in (groups, groups[::-1], groups[2:] + groups[:2], groups[1::-1] + groups[:1:-1]):
         flags = list(itertools.chain(*order))
         for command in (["a.exr", "b.exr", *flags], [*flags, "--", "a.exr", "b.exr"]):
             _, bound, _ = app.parse_args(

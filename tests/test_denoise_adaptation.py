@@ -107,10 +107,10 @@ def test_a_sequence_is_corrected_by_its_halves(halves, few_layers, denoise, monk
         return genuine(given, *others, start=start, **settings)
 
     monkeypatch.setattr(adaptation, "post_correct", correct)
-    flags = ["--post-correct", "--sequence", "--adapt-steps", 1]
+    flags = ["--post-correct", "--sequence", "--adapt-steps", 1, "--save", "sure"]
     flags += ["--halves", halves / "a", halves / "b"]
     status, told, err = denoise(halves / "in", "-o", halves / "out", *flags)
-    assert (status, err) == (0, "")
+    assert (status, err.count("SURE is too low"), len(err.splitlines())) == (0, 2, 2)
     assert [t["adaptation"]["reused"] for t in told] == [False, True]
     assert {t["adaptation"]["halves"] for t in told} == {"given"}
     assert [t["adaptation"]["steps"] for t in told] == [1, 1]

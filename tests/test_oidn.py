@@ -52,7 +52,7 @@ def test_parity_with_the_native_library(real_frame, name, quality, clean):
     assert relative_rmse(denoiser(frame), expected) < PARITY
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 19), (33, 1), (16, 16), (17, 15)])
+@pytest.mark.parametrize("size", [(1, 1), (33, 1), (17, 15)])
 def test_parity_at_odd_sizes(real_frame, size):
     frame = crop(real_frame, *size)
     assert relative_rmse(pd.denoisers.load("oidn-hdr")(frame), native(frame.color)) < PARITY

@@ -12,6 +12,8 @@ from hypothesis import strategies as st
 from progden_jax import transfer
 
 NAMES = ["log", "pu", "arctan"]
+FORWARD = {name: jax.jit(transfer.by_name(name).forward) for name in NAMES}
+INVERSE = {name: jax.jit(transfer.by_name(name).inverse) for name in NAMES}
 RADIANCE = np.concatenate([[0.0], np.geomspace(1e-6, 65504, 400)])
 # Where pu changes its piece, before and after.
 Y0, Y1 = 1.57945760e-6, 0.0322087631
@@ -37,8 +39,8 @@ SCALAR = {
 @pytest.mark.parametrize("name", NAMES)
 def test_forward_equals_scalar_reference(name, dtype, tolerance):
     with jax.enable_x64(dtype == "float64"):
-        y = jnp.asarray(RADIANCE, dtype)
-        x = transfer.by_name(name).forward(y)
+        y = RADIANCE.astype(dtype)
+        x = FORWARD[name](y)
         assert x.dtype == dtype
         expected = [SCALAR[name](float(v)) for v in y]
         np.testing.assert_allclose(x, expected, rtol=tolerance, atol=0)
@@ -49,10 +51,9 @@ def test_forward_equals_scalar_reference(name, dtype, tolerance):
 def test_dtype_and_shape_are_kept(name, dtype):
     with jax.enable_x64(dtype == "float64"):
         chosen = transfer.by_name(name)
-        y = jnp.full((2, 3, 4), 0.5, dtype)
+        y = jax.ShapeDtypeStruct((2, 3, 4), dtype)
         for function in (chosen.forward, chosen.inverse):
-            assert function(y).dtype == dtype
-            assert function(y).shape == y.shape
+            assert jax.eval_shape(function, y) == y
 
 
 # The log's slope at 65504 is 1/65504 of an output near 1: rounding there is worth 11 ulp of y.
@@ -60,17 +61,15 @@ def test_dtype_and_shape_are_kept(name, dtype):
 @pytest.mark.parametrize("name", ["log", "pu"])
 def test_round_trip(name, dtype, tolerance):
     with jax.enable_x64(dtype == "float64"):
-        chosen = transfer.by_name(name)
-        y = jnp.asarray(RADIANCE, dtype)
-        np.testing.assert_allclose(chosen.inverse(chosen.forward(y)), y, rtol=tolerance, atol=0)
+        y = RADIANCE.astype(dtype)
+        np.testing.assert_allclose(INVERSE[name](FORWARD[name](y)), y, rtol=tolerance, atol=0)
 
 
 @pytest.mark.parametrize("name", ["log", "pu"])
 @settings(deadline=None)
 @given(y=st.floats(2**-20, 65504, width=32))
 def test_round_trip_of_any_radiance(name, y):
-    chosen = transfer.by_name(name)
-    back = chosen.inverse(chosen.forward(jnp.float32(y)))
+    back = INVERSE[name](FORWARD[name](np.float32(y)))
     assert float(back) == pytest.approx(y, rel=5e-6)
 
 
@@ -119,7 +118,7 @@ def test_gradients_are_finite_and_right(name):
 
 @pytest.mark.parametrize("name", ["log", "pu"])
 def test_slope_at_zero_is_that_of_its_right_side(name):
-    slope = jax.grad(transfer.by_name(name).forward)
+    slope = jax.jit(jax.grad(FORWARD[name]))
     assert float(slope(jnp.float32(0))) == pytest.approx(float(slope(jnp.float32(1e-8))), rel=1e-5)
 
 
@@ -150,17 +149,17 @@ def test_pu_thresholds_belong_together():
 @pytest.mark.parametrize("name", NAMES)
 def test_forward_rises(name):
     with jax.enable_x64(True):
-        y = jnp.concatenate([-jnp.geomspace(10, 1e-6, 50), jnp.geomspace(1e-7, 1e6, 500)])
-        x = transfer.by_name(name).forward(y)
-        assert (jnp.diff(x) > 0).all()
-        assert (jnp.diff(transfer.by_name(name).inverse(x)) > 0).all()
+        y = np.concatenate([-np.geomspace(10, 1e-6, 50), np.geomspace(1e-7, 1e6, 500)])
+        x = FORWARD[name](y)
+        assert (np.diff(x) > 0).all()
+        assert (np.diff(INVERSE[name](x)) > 0).all()
 
 
 @pytest.mark.parametrize("name", ["log", "pu"])
 def test_half_range_becomes_zero_to_one(name):
-    ends = transfer.by_name(name).forward(jnp.asarray([0, 65504], jnp.float32))
+    ends = FORWARD[name](np.float32([0, 65504]))
     np.testing.assert_allclose(ends, [0, 1], atol=1e-6)
-    back = transfer.by_name(name).inverse(jnp.asarray([0, 1], jnp.float32))
+    back = INVERSE[name](np.float32([0, 1]))
     np.testing.assert_allclose(back, [0, 65504], rtol=1e-5)
 
 
@@ -172,19 +171,17 @@ def test_scale_of_pu():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_negative_values_stay_finite_and_come_back(name):
-    y = jnp.asarray([-1e-3, -0.5, -1.0, -20.0], jnp.float32)
-    chosen = transfer.by_name(name)
-    x = chosen.forward(y)
+    y = np.float32([-1e-3, -0.5, -1.0, -20.0])
+    x = np.asarray(FORWARD[name](y))
     assert (x < 0).all()
-    np.testing.assert_allclose(chosen.inverse(x), y, rtol=1e-5)
-    assert jnp.isfinite(jax.vmap(jax.grad(chosen.forward))(y)).all()
+    np.testing.assert_allclose(INVERSE[name](x), y, rtol=1e-5)
+    assert np.isfinite(jax.jit(jax.vmap(jax.grad(FORWARD[name])))(y)).all()
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_nan_is_not_hidden(name):
-    chosen = transfer.by_name(name)
-    assert jnp.isnan(chosen.forward(jnp.float32(jnp.nan)))
-    assert jnp.isnan(chosen.inverse(jnp.float32(jnp.nan)))
+    for function in (FORWARD[name], INVERSE[name]):
+        assert np.isnan(function(np.float32(np.nan)))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -216,8 +213,8 @@ def test_integers_are_refused(function):
 def test_srgb_against_the_standard():
     y = np.linspace(0, 1, 1001)
     expected = np.where(y <= 0.0031308, 12.92 * y, 1.055 * y ** (1 / 2.4) - 0.055)
-    found = transfer.srgb(jnp.asarray(y, jnp.float32))
+    found = jax.jit(transfer.srgb)(np.float32(y))
     np.testing.assert_allclose(found, expected, rtol=1e-5)
-    np.testing.assert_allclose(transfer.srgb_inverse(found), y, rtol=1e-4, atol=1e-7)
-    gradient = jax.vmap(jax.grad(transfer.srgb))(jnp.asarray([0.0, 1e-3, 0.0031308, 1.0]))
+    np.testing.assert_allclose(jax.jit(transfer.srgb_inverse)(found), y, rtol=1e-4, atol=1e-7)
+    gradient = jax.jit(jax.vmap(jax.grad(transfer.srgb)))(np.float32([0, 1e-3, 0.0031308, 1]))
     assert np.isfinite(gradient).all()
