@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
@@ -74,7 +75,7 @@ class Frame:
                     "all buffers of a frame must come from the same render at the same size."
                 )
         for name, value in buffers.items():
-            setattr(self, name, None if value is None else jnp.asarray(value))
+            setattr(self, name, None if value is None else _held(value))
         self.spp = None if spp is None else jnp.broadcast_to(spp, self.color.shape[:-3])
 
     @property
@@ -111,6 +112,11 @@ class Frame:
 
 
 _FIELDS = ("color", "variance", "albedo", "normal", "depth", "spp")
+
+
+def _held(value: Any) -> jax.Array:
+    """A copy on the device. `jnp.asarray` would compile a program for each new shape, for 25 ms."""
+    return value if isinstance(value, jax.Array) else jax.device_put(np.array(value))
 
 
 def _size(value: Any) -> str:

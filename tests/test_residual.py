@@ -39,7 +39,7 @@ def network(blocks=2, width=4, inputs=INPUTS, **settings) -> ResidualNet:
 @pytest.fixture(scope="module")
 def frame(real_frame) -> pd.Frame:
     part = jax.tree.map(lambda a: a[50:60, 60:71], real_frame.replace(spp=None))
-    albedo = part.albedo.copy()
+    albedo = np.array(part.albedo)
     albedo[0, 0] = 200
     return part.replace(albedo=albedo)
 
