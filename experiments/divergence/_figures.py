@@ -17,14 +17,9 @@ COLORS = {
     "exact": "black",
 }
 TARGETS = {4: 0.38, 16: 0.20, 64: 0.12, 256: 0.06}
-"""Of the error over that of as many differences, or, by cones, of the next number of them that is here."""
+"""Of the error over that of as many differences, or of no fewer passes."""
 
 Row = dict[str, str]
-
-
-def budget(count: int) -> int:
-    """The number of differences that so many passes are compared with."""
-    return min((k for k in TARGETS if k >= count), default=count)
 
 
 def medians(rows: Sequence[Row]) -> dict[tuple[str, str, int], dict[str, float]]:
@@ -35,8 +30,7 @@ def medians(rows: Sequence[Row]) -> dict[tuple[str, str, int], dict[str, float]]
         cell = {name: float(row[name]) for name in ("error", "mean_error", "passes", "seconds")}
         cell["image"], cell["rmse"] = float(row["image"]), abs(float(row["rmse_ratio"]) - 1)
         cell["smape"] = abs(float(row["smape_ratio"]) - 1)
-        compared = budget(count) if method == "truncated" else count
-        other = frames.get((denoiser, scene, spp, "differences", compared))
+        other = frames.get((denoiser, scene, spp, "differences", count))
         cell["ratio"] = float("nan") if other is None else cell["error"] / float(other["error"])
         for name in ("sure", "sure_window", "alpha"):
             cell[name] = float(row[name]) / float(row[f"{name}_exact"])
@@ -65,9 +59,7 @@ def table(rows: Sequence[Row]) -> str:
     }
     lines = []
     for (denoiser, method, count), cell in sorted(medians(rows).items(), key=lambda g: g[0][::2]):
-        target = ""
-        if method in ("probing", "truncated"):
-            target = TARGETS.get(budget(count) if method == "truncated" else count, "")
+        target = TARGETS.get(count, "") if method in ("probing", "truncated") else ""
         values = [float(f"{cell[name]:.3g}") for name in names]
         lines.append((denoiser, method, count, *values, target))
     return _common.markdown(("denoiser", "method", "K", *names.values(), "target"), lines)

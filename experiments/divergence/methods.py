@@ -33,12 +33,11 @@ WINDOW = 15
 NAMES = ("exact", "differences", "rademacher", "probing", "truncated")
 TRUNCATED = {
     4: pd.TruncatedCone(levels=1, whole=0),
-    10: pd.TruncatedCone(levels=1),
-    16: pd.TruncatedCone(levels=2, radius=(1, 1), whole=0),
-    32: pd.TruncatedCone(levels=2),
-    87: pd.TruncatedCone(levels=3),
+    16: pd.TruncatedCone(levels=1, whole=1 / 32),
+    64: pd.TruncatedCone(levels=2, whole=1 / 12),
+    256: pd.TruncatedCone(levels=3, whole=1 / 4),
 }
-"""By about how many forward passes they take with OIDN's base network at 128×128."""
+"""By the number of probes that takes as long or longer, with OIDN's base network."""
 
 HEADER = (
     *("denoiser", "scene", "spp", "method", "probes", "passes", "seconds"),
