@@ -32,13 +32,12 @@ WINDOW = 15
 
 NAMES = ("exact", "differences", "rademacher", "probing", "truncated")
 TRUNCATED = {
-    4: pd.TruncatedCone(levels=1, whole=0),
-    10: pd.TruncatedCone(levels=1),
-    16: pd.TruncatedCone(levels=2, radius=(1, 1), whole=0),
-    32: pd.TruncatedCone(levels=2),
-    87: pd.TruncatedCone(levels=3),
+    4: pd.TruncatedCone(levels=1),
+    16: pd.TruncatedCone(levels=2, radius=(1, 1)),
+    26: pd.TruncatedCone(levels=2),
+    81: pd.TruncatedCone(levels=3),
 }
-"""By about how many forward passes they take with OIDN's base network at 128×128."""
+"""By about how many forward passes they take with OIDN's base network."""
 
 HEADER = (
     *("denoiser", "scene", "spp", "method", "probes", "passes", "seconds"),
@@ -62,7 +61,7 @@ def methods(most: int) -> list[tuple[str, int, pd.Method]]:
 def passes(name: str, count: int, f: Any, x: jax.Array) -> float:
     """Denoiser passes: the forward one, and one per probe; of cones what their plan counts."""
     if name == "truncated":
-        return 1 + TRUNCATED[count].cost(f, x)
+        return 1 + TRUNCATED[count].cost(f)
     return 1 + (pd.Exact().cost(f, x)["cone"] if name == "exact" else count)
 
 

@@ -7,12 +7,11 @@ through the windows alone. Pixels of equal phase (position modulo the largest st
 windows and form one batch; offsets that differ between phases are traced, so one program serves all.
 """
 
-import math
 from typing import Any
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from progden_jax.denoisers import graph as g
 from progden_jax.divergence._sweep import Sweep, filtered, margin
@@ -98,68 +97,16 @@ def some_cells(
 
     `phase` and `first` may be traced. Beyond the last pixel of the phase the last one is repeated.
     """
-    chunk, last = min(chunk, number), cells_per_phase(plan, size) - 1
-    numbers = first + jnp.arange(-(-number // chunk) * chunk)
-    cells = jnp.minimum(numbers, last).reshape(-1, chunk)
-    found = these_cells(plan, params, surrounded, size, phase, cells, precision=precision)
-    return found[:number]
+    period = plan.period
+    across, last = size[1] // period, cells_per_phase(plan, size) - 1
+    chunk = min(chunk, number)
+    place = (phase // period, phase % period)
 
-
-def these_cells(
-    plan: Plan,
-    params: Any,
-    surrounded: dict[int, Any],
-    size: tuple[int, int],
-    phase: Array,
-    cells: Int[Array, "chunks chunk"],
-    *,
-    precision: Any,
-) -> Float[Array, "cells 3"]:
-    """The diagonal at the pixels of a phase with these numbers, a chunk of them at once."""
-    across, place = size[1] // plan.period, (phase // plan.period, phase % plan.period)
-
-    def some(cells: Array) -> Array:
+    def some(start: Array) -> Array:
+        cells = jnp.minimum(start + jnp.arange(chunk), last)
         split = (cells // across, cells % across)
         sweep = Sweep(plan, params, surrounded, place, split, precision)
         return jnp.diagonal(sweep.run(), axis1=1, axis2=2)
 
-    return lax.map(some, cells).reshape(-1, 3)
-
-
-def replaced_where_largest(
-    plan: Plan,
-    params: Any,
-    kept: dict[int, Any],
-    diagonal: Float[Array, "h w 3"],
-    weight: Float[Array, "h w"],
-    share: float,
-    *,
-    chunk: int,
-    precision: Any,
-) -> Float[Array, "h w 3"]:
-    """The diagonal with this plan's at a share of the pixels: of each phase those of the largest weight."""
-    kept, period = surround(plan, kept), plan.period
-    size = weight.shape[0], weight.shape[1]
-    rows, columns = size[0] // period, size[1] // period
-    count = chosen_per_phase(plan, size, share)
-    chunk = min(chunk, count)
-    by_phase = weight.reshape(rows, period, columns, period).transpose(1, 3, 0, 2)
-    # The barrier keeps XLA from sorting a constant while it compiles, which takes minutes.
-    by_phase = lax.optimization_barrier(by_phase.reshape(period**2, rows * columns))
-
-    def of_phase(phase: Array) -> tuple[Array, Array]:
-        cells = lax.top_k(by_phase[phase], count)[1]
-        padded = jnp.pad(cells, (0, -count % chunk), mode="edge").reshape(-1, chunk)
-        found = these_cells(plan, params, kept, size, phase, padded, precision=precision)
-        return cells, found[:count]
-
-    phases = jnp.arange(period**2)
-    cells, found = lax.map(of_phase, phases)
-    row = period * (cells // columns) + (phases // period)[:, None]
-    column = period * (cells % columns) + (phases % period)[:, None]
-    return diagonal.at[row, column].set(found)
-
-
-def chosen_per_phase(plan: Plan, size: tuple[int, int], share: float) -> int:
-    """Pixels of each phase that a share of all of them comes to, at least one."""
-    return math.ceil(share * cells_per_phase(plan, size))
+    found = lax.map(some, first + jnp.arange(0, number, chunk))
+    return found.reshape(-1, 3)[:number]

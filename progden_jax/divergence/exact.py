@@ -164,12 +164,19 @@ def check_layered(f: Function) -> None:
         )
 
 
-def by_cone(f: Function, x: Array, chunk: int | None = None) -> tuple[Array, Array]:
-    """f(x) and ∂f/∂x at every pixel and channel, by windows; ValueError if f shows no layers."""
-    layered = layers_of(f, x)
+def by_cone(f: Function, x: Array, chunk: int | None = None, **limits: Any) -> tuple[Array, Array]:
+    """f(x) and ∂f/∂x at every pixel and channel, by windows within the `limits` of `windows.plan`.
+
+    Raises
+    ------
+    ValueError
+        If f shows no layers.
+    """
+    check_layered(f)
+    layered: graph.Layered = f.layered(x)  # pyright: ignore[reportFunctionMemberAccess]
     value, slope, kept = cone_primal(layered, x)
     diagonal = cone.jacobian_diagonal(
-        windows.plan(layered.nodes, layered.params),
+        windows.plan(layered.nodes, layered.params, **limits),
         layered.params,
         kept,
         (layered.inputs.shape[0], layered.inputs.shape[1]),
@@ -177,12 +184,6 @@ def by_cone(f: Function, x: Array, chunk: int | None = None) -> tuple[Array, Arr
         precision=lax.Precision.HIGHEST,
     )
     return value, slope * diagonal[: x.shape[0], : x.shape[1]]
-
-
-def layers_of(f: Function, x: Array) -> graph.Layered:
-    """What f shows of itself at x; ValueError if it shows nothing."""
-    check_layered(f)
-    return f.layered(x)  # pyright: ignore[reportFunctionMemberAccess]
 
 
 def cone_cost(nodes: Sequence[graph.Node], params: Any, **limits: Any) -> float:

@@ -4,19 +4,11 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
 from progden_jax import _checks
-from progden_jax.divergence import cone, windows
 from progden_jax.divergence._base import Evaluation, Function, Origin
-from progden_jax.divergence.exact import (
-    check_layered,
-    cone_chunk,
-    cone_cost,
-    cone_primal,
-    layers_of,
-)
+from progden_jax.divergence.exact import by_cone, check_layered, cone_cost
 
 
 @jax.tree_util.register_static
@@ -38,9 +30,6 @@ class TruncatedCone:
     radius : pixels that windows reach to either side, at least 1: of the coarsest level that is kept, in its
         own pixels, or a tuple of each level's from the finest on. None: as far as there is a path from a
         pixel to itself. In a network that doesn't pool this bounds all windows.
-    whole : the share of pixels, those of the largest variance, that get the whole windows of `Exact("cone")`:
-        a few hold most of σ²·∂f/∂x where there are fireflies. Of each position modulo the network's stride
-        at least one; 0 for none.
     chunk : pixels at once; memory grows with it. None: as many as make efficient products.
 
     Raises
@@ -55,7 +44,6 @@ class TruncatedCone:
 
     levels: int = 3
     radius: int | tuple[int, ...] | None = 1
-    whole: float = 1 / 64
     chunk: int | None = None
 
     def __post_init__(self) -> None:
@@ -68,8 +56,6 @@ class TruncatedCone:
             raise ValueError(
                 f"radius is {self.radius} and levels is {self.levels}: expected one number per level."
             )
-        if not 0 <= self.whole <= 1:
-            raise ValueError(f"whole is {self.whole}, expected a share of the pixels from 0 to 1.")
         if self.chunk is not None:
             _checks.positive_int("chunk", self.chunk)
 
@@ -83,31 +69,11 @@ class TruncatedCone:
         origin: Origin = (0, 0),
     ) -> Evaluation:
         del key, origin
-        layered = layers_of(f, x)
-        value, slope, kept = cone_primal(layered, x)
-        size = layered.inputs.shape[0], layered.inputs.shape[1]
-        how = {"chunk": self.chunk or cone_chunk(), "precision": lax.Precision.HIGHEST}
-        network = layered.nodes, layered.params
-        short = windows.plan(*network, levels=self.levels, radius=self.radius)
-        diagonal = cone.jacobian_diagonal(short, layered.params, kept, size, **how)
-        if self.whole:
-            padding = [(0, whole - part) for whole, part in zip(size, x.shape, strict=False)]
-            weight = jnp.pad(lax.stop_gradient(variance).max(-1), padding, constant_values=-1)
-            diagonal = cone.replaced_where_largest(
-                *(windows.plan(*network), layered.params, kept, diagonal, weight, self.whole), **how
-            )
-        diagonal = slope * diagonal[: x.shape[0], : x.shape[1]]
+        value, diagonal = by_cone(f, x, self.chunk, levels=self.levels, radius=self.radius)
         return Evaluation(value, variance * diagonal, jnp.full_like(value, jnp.inf))
 
-    def cost(self, f: Function, x: Float[Array, "h w 3"]) -> float:
+    def cost(self, f: Function) -> float:
         """Multiply-adds of the windows against the network's: forward passes beside the one for f(x)."""
         check_layered(f)
         nodes, params = f.layers  # pyright: ignore[reportFunctionMemberAccess]
-        short = cone_cost(nodes, params, levels=self.levels, radius=self.radius)
-        if not self.whole:
-            return short
-        plan = windows.plan(nodes, params)
-        height, width = (-(-n // plan.period) * plan.period for n in x.shape[:2])
-        chosen = cone.chosen_per_phase(plan, (height, width), self.whole)
-        share = chosen / cone.cells_per_phase(plan, (height, width))
-        return short + share * cone_cost(nodes, params)
+        return cone_cost(nodes, params, levels=self.levels, radius=self.radius)
