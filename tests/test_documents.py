@@ -1,14 +1,12 @@
 """README and guides: their code runs, their commands, flags, files and names exist."""
 
 import importlib.util
-import os
 import re
-import subprocess
-import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
+import document_runs
 import pytest
 from cyclopts import App, CycloptsError
 from documents import DOCUMENTS, ROOT, blocks, commands
@@ -73,16 +71,16 @@ def test_every_command_exists_with_its_flags(document):
     found = [b for b in blocks(document.read_text()) if b.language == "sh"]
     assert found
     for block in found:
-        for command in commands(block.text):
-            check(command)
+        for command in commands(block):
+            check(command.words)
 
 
 @pytest.mark.parametrize("name", helps())
 def test_examples_in_help_texts_exist_with_their_flags(name):
     for block in blocks(helps()[name]):
         if not block.language:
-            for command in commands(block.text):
-                check(command)
+            for command in commands(block):
+                check(command.words)
 
 
 def test_a_flag_or_command_that_is_gone_would_be_noticed():
@@ -133,21 +131,24 @@ def test_named_configurations_load(document, tmp_path):
         config.load(TRAINING[kind], tmp_path / name)
 
 
-def test_blocks_run(tmp_path):
-    """In one process of its own, for what they compile runs once: optimising it would take longer."""
-    quick = "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
-    environment = os.environ | {
-        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {quick}",
-        "JAX_TRACEBACK_IN_LOCATIONS_LIMIT": "0",
-        "PROGDEN_CACHE": str(tmp_path / "cache"),
+@pytest.mark.documents
+@pytest.mark.parametrize(
+    "document", sorted(DOCUMENTS, key=lambda path: -path.stat().st_size), ids=lambda path: path.stem
+)
+def test_every_block_runs(document, tmp_path, tmp_path_factory, worker_id, monkeypatch):
+    """In a lane of its own, see .ci/run, the longest first; it needs all extras but `bench`."""
+    base = tmp_path_factory.getbasetemp()
+    shared = base if worker_id == "master" else base.parent
+    monkeypatch.setenv("PROGDEN_CACHE", str(shared / "programs"))
+    document_runs.run(document, tmp_path / "clone")
+
+
+def test_every_smaller_command_is_in_a_document():
+    used = {
+        document_runs.entry_of(command.words)
+        for document in DOCUMENTS
+        for block in blocks(document.read_text())
+        if block.language == "sh"
+        for command in commands(block)
     }
-    environment["PYTHONPATH"] = os.pathsep.join([str(ROOT / "tests"), *sys.path])
-    done = subprocess.run(
-        [sys.executable, "-W", "error", ROOT / "tests" / "documents.py", *DOCUMENTS],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    assert used == {None, *document_runs.SMALLER}

@@ -224,6 +224,18 @@ def test_a_seed_gives_the_same_scene_and_image(kind):
         assert not np.array_equal(first, picture(8))
 
 
+@pytest.mark.parametrize("kind", list(rendering.KINDS))
+def test_shapes_are_loaded_by_mitsuba_from_files_that_go_with_the_scene(kind):
+    """Those that Python has seen cost its lock in every sample of albedo, normal and depth."""
+    scene = rendering.scene(3, kind)
+    assert all(isinstance(value, dict | str) for value in scene.values())
+    files = [Path(shape["filename"]) for shape in scene.values() if "filename" in shape]
+    assert files
+    assert all(file.exists() for file in files)
+    del scene
+    assert not any(file.exists() for file in files)
+
+
 @pytest.mark.skipif(bool(_mitsuba._llvm_problem()), reason="needs a libLLVM that works")
 def test_wavefronts_agree_with_the_scalar_variant():
     scene = {k: v for k, v in simple().items() if k != "ball"}

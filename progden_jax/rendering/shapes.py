@@ -4,7 +4,9 @@ A thing stands on y = 0 around the origin and fits, with the transform `at`, whe
 in metres.
 """
 
+import os
 import tempfile
+import weakref
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -225,8 +227,6 @@ def curves(
     strands: Sequence[Points], radius: float, at: Any, bsdf: Any, *, smooth: bool = True
 ) -> Shape:
     """Round strands through (smooth: near) points."""
-    import mitsuba as mi
-
     ends = 2 if smooth else 0  # a B-spline begins and ends at a point that is there three times
     text = "\n\n".join(
         "\n".join(
@@ -235,11 +235,9 @@ def curves(
         for s in strands
     )  # fmt: skip
     kind = "bsplinecurve" if smooth else "linearcurve"
-    # Loaded at once: these plugins read files only, and ours is gone after.
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, "strands.txt")
-        path.write_text(text + "\n")
-        return mi.load_dict({"type": kind, "filename": str(path), "to_world": at, "bsdf": bsdf})
+    path = _Temporary(".txt")
+    Path(path).write_text(text + "\n")
+    return {"type": kind, "filename": path, "to_world": at, "bsdf": bsdf}
 
 
 def _triangles(
@@ -248,12 +246,8 @@ def _triangles(
     """A mesh, smooth if it has texture coordinates and flat if not."""
     import mitsuba as mi
 
-    properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict(bsdf)
     smooth = uv is not None
-    properties["face_normals"] = not smooth
-    with_ = {"has_vertex_normals": smooth, "has_vertex_texcoords": smooth}
-    found = mi.Mesh("mesh", len(points), len(faces), props=properties, **with_)
+    found = mi.Mesh("mesh", len(points), len(faces), has_vertex_texcoords=smooth)
     matrix = np.array(at.matrix)
     values = mi.traverse(found)
     values["vertex_positions"] = (
@@ -263,7 +257,24 @@ def _triangles(
     if uv is not None:
         values["vertex_texcoords"] = uv.astype(np.float32).ravel()
     values.update()
-    return found
+    path = _Temporary(".ply")
+    found.write_ply(path)
+    return {"type": "ply", "filename": path, "face_normals": not smooth, "bsdf": bsdf}
+
+
+class _Temporary(str):
+    """The path of a file that is removed when the path is forgotten.
+
+    Mitsuba loads them itself: a shape that Python has seen costs its scalar variant Python's lock in every
+    sample of albedo, normal and depth, which count references to all shapes: longer than the path takes.
+    """
+
+    def __new__(cls, suffix: str) -> "_Temporary":
+        descriptor, path = tempfile.mkstemp(suffix, "progden_shape_")
+        os.close(descriptor)
+        made = super().__new__(cls, path)
+        weakref.finalize(made, Path(path).unlink, missing_ok=True)
+        return made
 
 
 def _directions(rng: np.random.Generator, count: int) -> Points:
