@@ -72,8 +72,8 @@ def progressive_denoise(
         for: of the other outputs nothing is known there. True stands for ``Skip()``.
     max_memory : bytes that the call may take beyond the frame itself. A frame that needs more is computed in
         windows that overlap by what the networks look at, one program for all sizes, and its images come
-        as NumPy arrays. The result is the same to 1e-5, but for methods that weigh the whole frame (`Probing`
-        ranks its variances): these look at each window alone.
+        as NumPy arrays. The result is the same to 1e-5, but for methods that rank the frame's variances
+        (`Probing`, `TruncatedCone`): these look at each window alone.
     canvas : height and width to compute at, at least the frame's, so that frames of several sizes share a
         program; by default both rounded up, see `canvas_size`.
     devices : to compute on, each a window of the frame at a time, as with `max_memory`, which is then that
