@@ -66,6 +66,8 @@ def test_with_all_levels_windows_are_those_of_the_exact_divergence(pooled, level
     )
     assert (plan.period, plan.levels) == (full.period, full.levels) == (2, full.levels)
     for ours, theirs in zip(plan.windows, full.windows, strict=True):
+        assert ours is not None
+        assert theirs is not None
         assert ours.size == theirs.size
         np.testing.assert_array_equal(ours.origin, theirs.origin)
 
