@@ -11,6 +11,7 @@ from pathlib import Path
 from types import ModuleType
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import DEMO
@@ -32,6 +33,7 @@ from experiments.performance import denoisers as denoiser_times
 from experiments.performance import run as performance
 from experiments.related_work import limit as related_work_limit
 from experiments.related_work import plot as related_work
+from experiments.stability import rounding
 from experiments.stability import run as stability
 from experiments.table1 import plot as table1
 from experiments.table2 import plot as table2
@@ -436,6 +438,19 @@ def test_a_run_that_lacks_what_a_plot_shows_is_told(command, noisy, tmp_path):
     run = results(EXPERIMENTS / "fig10" / "sweep.yaml", noisy, tmp_path / "two")
     with pytest.raises(SystemExit, match="one denoiser, and the run has oidn-hdr, oidn-hdr-alb"):
         command(fig14, run, "--output", tmp_path)
+
+
+def test_tf32_is_emulated(near_sighted, real_frame):
+    """In values and tangents: three digits of their convolutions, not all and not none."""
+    frame = jax.tree.map(lambda a: jnp.asarray(a[40:48, 30:38]) if a.ndim else a, real_frame)
+    f, x = near_sighted.bind(frame), jnp.asarray(frame.color)
+
+    def both(f):
+        return jax.jit(lambda x: jax.jvp(f, (x,), (x,)))(x)
+
+    for exact, rounded in zip(both(f), both(rounding.tf32(f)), strict=True):
+        error = np.sqrt(((exact - rounded) ** 2).mean() / (exact**2).mean())
+        assert 1e-6 < error < 1e-2
 
 
 def test_stability(command, monkeypatch, tiny, tmp_path):
