@@ -38,9 +38,10 @@ METHODS = {
     "monte-carlo-gaussian": MethodChoice("MonteCarlo", {"distribution": "gaussian"}),
     "finite-difference": MethodChoice("FiniteDifference"),
     "probing": MethodChoice("Probing"),
-    "cone-1": MethodChoice("TruncatedCone", {"levels": 1}, takes_probes=False),
-    "cone-2": MethodChoice("TruncatedCone", {"levels": 2}, takes_probes=False),
-    "cone-3": MethodChoice("TruncatedCone", {"levels": 3}, takes_probes=False),
+    **{
+        f"cone-{levels}": MethodChoice("TruncatedCone", {"levels": levels}, takes_probes=False)
+        for levels in (1, 2, 3)
+    },
     "exact": MethodChoice("Exact", takes_probes=False),
 }
 

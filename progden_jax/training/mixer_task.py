@@ -1,7 +1,7 @@
 """What it is to train a mixing network: its examples, loss and evaluation."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -26,20 +26,22 @@ from progden_jax.training.config import CombinerConfig, MixerConfig
 from progden_jax.training.estimates import EstimateCache
 from progden_jax.tstatistic import t_bound
 
-METHODS = {
+_WITHOUT_PROBES: dict[str, Method] = {
+    **{f"cone-{levels}": TruncatedCone(levels) for levels in (1, 2, 3)},
+    "exact": Exact(),
+}
+
+WITHOUT_PROBES = tuple(_WITHOUT_PROBES)
+"""Estimators that take no probes, and no random numbers."""
+
+METHODS: dict[str, Callable[[int], Method]] = {
     "monte-carlo": MonteCarlo,
     "monte-carlo-gaussian": lambda probes: MonteCarlo(probes, "gaussian"),
     "finite-difference": FiniteDifference,
     "probing": Probing,
-    "cone-1": lambda _: TruncatedCone(1),
-    "cone-2": lambda _: TruncatedCone(2),
-    "cone-3": lambda _: TruncatedCone(3),
-    "exact": lambda _: Exact(),
+    **{name: lambda _, method=method: method for name, method in _WITHOUT_PROBES.items()},
 }
 """Estimators by the names that `progden denoise --method` has for them, of a number of probes."""
-
-WITHOUT_PROBES = ("cone-1", "cone-2", "cone-3", "exact")
-"""Those that take none, and no random numbers."""
 
 
 class MixerTask:
