@@ -960,6 +960,20 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
+def test_time_left_is_told_while_a_percent_takes_minutes():
+    shown = importlib.import_module("progden_jax.cli.denoise")._Bars(1)
+    seconds = [0.0]
+    shown.bars.get_time = lambda: seconds[0]
+    (files,) = shown.bars.tasks
+    assert not files.visible
+    for done in range(150, 160):
+        shown.follow(done, 10_000)
+        seconds[0] += 5
+    *_, part = shown.bars.tasks
+    assert part.completed == pytest.approx(1.59)
+    assert part.time_remaining == pytest.approx(5 * (10_000 - 159), rel=1e-3)
+
+
 def test_an_interrupted_exact_divergence_is_resumed(tmp_path, frames, progden, monkeypatch):
     """By the same command, to the same bits; nothing of it is left then."""
     path, out = tmp_path / "room.exr", tmp_path / "clean.exr"

@@ -140,7 +140,7 @@ def test_any_inputs(frame):
 def test_it_reaches_35_pixels(frame):
     """As it says, and as the derivative's program says."""
     x = jnp.zeros((72, 74, 3))
-    net = network(16, 1, ())
+    net = network(16, 8, ())
     f = net.bind(pd.Frame(x, None))
     assert (f.receptive_radius, f.alignment) == (35, 1)
     assert _reach.radii(lambda x: f(x), x) == (35, 35)

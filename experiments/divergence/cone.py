@@ -51,7 +51,7 @@ def main() -> None:
     def primal(f: Any, x: jax.Array) -> Any:
         shown = f.layered(x)
         output, kept = graph.evaluate(shown.nodes, shown.params, shown.inputs)
-        return output, cone.surround(plan, kept)
+        return output, cone.prepare(plan, shown.params, kept)
 
     def phase(params: Any, kept: Any, index: jax.Array, *, chunk: int) -> jax.Array:
         exactly = jax.lax.Precision.HIGHEST

@@ -53,7 +53,7 @@ class Scene:
         paper = mixers.build("paper")
         self.paper = mixers.NetworkMixer(jax.jit(paper.init)(KEY), paper)
         self.shipped = mixers.default_for(denoiser)
-        self.operations = 2 * self.pixels * graph.multiply_adds(*self.f.layers)
+        self.operations = 2 * self.pixels * graph.multiply_adds(*self.f.layers, plain=True)
 
     def operations_of(self, mixer: Any) -> float:
         """Of a mixing network's convolutions."""

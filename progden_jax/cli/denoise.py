@@ -210,7 +210,7 @@ class _Bars(Shown):
     """Progress on stderr if that is a terminal: of the files if they are many, and of what is long."""
 
     def __init__(self, total: int) -> None:
-        self.bars = timed()
+        self.bars = timed(speed_estimate_period=120)
         self.many = total > 1
         self.files = self.bars.add_task("", total=total, name="", completed=-1, visible=self.many)
         self.part: TaskID | None = None
@@ -233,7 +233,8 @@ class _Bars(Shown):
         if self.part is None:
             self.bars.start()
             self.part, self.label = self.bars.add_task("", total=100, name=label), label
-        self.bars.update(self.part, completed=100 * done // total)
+        # Not in whole percents, each of which may take longer than what the speed is taken from.
+        self.bars.update(self.part, completed=100 * done / total)
         if done == total:
             self._end_part()
 

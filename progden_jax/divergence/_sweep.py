@@ -1,7 +1,7 @@
 """The tangents of a batch of pixels through the windows that matter for the exact diagonal, see `cone`."""
 
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,18 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from progden_jax.denoisers import graph as g
-from progden_jax.divergence.windows import Plan, Window, shifting, split_channels
+from progden_jax.divergence._short import Axis
+from progden_jax.divergence.windows import Plan, Window, convolutions
+
+
+class Prepared(NamedTuple):
+    """What all sweeps over a frame share."""
+
+    kept: dict[int, Any]
+    """What the primal pass kept, by node, with a margin that lets no tangent through."""
+    kernels: dict[int, list[Array]]
+    """By convolution and source, at the points of `_short`: (kinds, kinds, points, points, in, out), the
+    column's first; within a sweep those of its phase."""
 
 
 class Sweep:
@@ -20,13 +31,15 @@ class Sweep:
         self,
         plan: Plan,
         params: Any,
-        kept: dict[int, Any],
+        prepared: Prepared,
         phase: tuple[Array, Array],
         cells: tuple[Array, Array],
         precision: Any,
     ) -> None:
-        self.plan, self.params, self.kept = plan, params, kept
+        self.plan, self.params = plan, params
+        self.kept, self.kernels = prepared
         self.phase, self.cells, self.precision = phase, cells, precision
+        self.convolutions = convolutions(plan, params)
 
     def run(self) -> Float[Array, "cells 3 3"]:
         """∂output_c/∂input_d of each cell's pixel, (cells, d, c)."""
@@ -43,12 +56,9 @@ class Sweep:
                     unit = jnp.eye(
                         3, g.input_channels(self.plan.nodes, self.params), dtype=self._dtype()
                     )
-                    value = jnp.broadcast_to(
-                        unit[None, :, None, None], (number, 3, 1, 1, unit.shape[1])
-                    )
-                    value = value.reshape(3 * number, 1, 1, -1)
+                    value = jnp.repeat(unit, number, axis=0)[None, None]
                 case g.Conv():
-                    value = self._convolve(node, window, values)
+                    value = self._convolve(index, values)
                     if index in self.kept:
                         value = self._scale(value, self._slope(index, window))
                 case g.Relu():
@@ -78,7 +88,7 @@ class Sweep:
                     )
             values[index] = value
         last = values[len(plan.nodes) - 1]
-        return last.reshape(-1, 3, last.shape[-1])
+        return last.reshape(3, -1, last.shape[-1]).swapaxes(0, 1)
 
     def _dtype(self) -> Any:
         return jax.tree.leaves(self.params)[0].dtype
@@ -92,132 +102,48 @@ class Sweep:
         """A node's tangents in the window of one that reads it, which may be narrower."""
         return self._move(values[source], self._window(source), window)
 
-    def _convolve(self, node: g.Conv, window: Window, values: dict[int, Array]) -> Array:
-        kernel = self.params[node.layer]["kernel"]
+    def _convolve(self, index: int, values: dict[int, Array]) -> Array:
         total = None
-        for source, part in zip(
-            node.sources, split_channels(self.plan, self.params, node), strict=True
-        ):
-            if source not in values:
-                continue
-            weights = kernel[:, :, part]
-            if isinstance(self.plan.nodes[source], g.Upsample):
-                below = self.plan.nodes[source]
-                assert isinstance(below, g.Upsample)
-                added = self._convolve_upsampled(
-                    values[source],
-                    self._window(below.source),
-                    self.plan.levels[source],
-                    weights,
-                    window,
-                )
-            else:
-                added = self._convolve_window(values[source], self._window(source), weights, window)
+        for part, kernel in zip(self.convolutions[index][1], self.kernels[index], strict=True):
+            added = self._convolve_window(values[part.source], part.axis, kernel)
             total = added if total is None else total + added
         assert total is not None
         return total
 
-    def _convolve_window(self, x: Array, source: Window, weights: Array, target: Window) -> Array:
-        """The convolution of a window, zero around it, as far as the target window goes."""
-        r = weights.shape[0] // 2
-        if shifting(source, target):
-            if source.size < target.size:
-                wide = Window(source.origin - r, source.size + 2 * r)
-                return self._move(self._convolve_window(x, source, weights, wide), wide, target)
-            wide = Window(target.origin - r, target.size + 2 * r)
-            x, source = self._move(x, source, wide), wide
-        before = r - int(target.origin[0] - source.origin[0])
-        padding = (before, target.size - source.size - before + 2 * r)
-        return lax.conv_general_dilated(
-            x,
-            weights,
-            (1, 1),
-            (padding, padding),
-            dimension_numbers=("NHWC", "HWIO", "NHWC"),
-            precision=self.precision,
-        )
+    def _convolve_window(self, x: Array, axis: Axis, kernel: Array) -> Array:
+        """A window, (rows, columns, n, c), along columns and rows as `_short.Axis` says."""
+        tiles, points = axis.tiles, kernel.shape[0]
+        split = (tiles, points)
+        x = self._combine(axis.spread, 0, x, 0).reshape(*split, *x.shape[1:])
+        x = self._combine(axis.spread, 1, x, 2).reshape(*split, *split, *x.shape[3:])
+        # Tiles count among the windows of a batch: they share the kernel.
+        x = x.transpose(1, 3, 0, 2, 4, 5)
+        shape = x.shape
+        x = jnp.matmul(x.reshape(points, points, -1, shape[-1]), kernel, precision=self.precision)
+        x = x.reshape(*shape[:-1], -1).transpose(2, 0, 3, 1, 4, 5)
+        x = self._combine(axis.combine, 1, x.reshape(tiles * points, *x.shape[2:]), 0)
+        x = x.reshape(x.shape[0], tiles * points, *x.shape[3:])
+        return self._combine(axis.combine, 0, x, 1)
 
-    def _product(self, x: Array, weights: Array) -> Array:
-        flat = jnp.matmul(x.reshape(-1, x.shape[-1]), weights, precision=self.precision)
-        return flat.reshape(*x.shape[:-1], weights.shape[-1])
+    def _combine(self, matrices: np.ndarray, axis: int, x: Array, along: int) -> Array:
+        """The phase's matrix times x along one of its axes, which then comes first.
 
-    def _convolve_upsampled(
-        self, x: Array, source: Window, level: int, weights: Array, target: Window
-    ) -> Array:
-        """3×3 after nearest upsampling, as 2×2 on what was upsampled: 4 products for 9.
-
-        Of an upsampled position v, odd ones see their parent with weights 0 + 1 and the next with 2; even
-        ones the parent before with 0 and their own with 1 + 2. Which target positions are odd
-        depends on the phase, so weights and starts are chosen by it.
+        As sums of slices: XLA's products with matrices this small take several times as long.
         """
-        folded = []
-        for even in (False, True):
-            rows = (
-                (weights[0], weights[1] + weights[2])
-                if even
-                else (weights[0] + weights[1], weights[2])
-            )
-            folded.append(
-                [
-                    [
-                        (row[0], row[1] + row[2]) if e else (row[0] + row[1], row[2])
-                        for e in (False, True)
-                    ]
-                    for row in rows
-                ]
-            )
-        # (row parity, column parity, tap row, tap column, in, out)
-        kernels = jnp.stack(
-            [
-                jnp.stack(
-                    [jnp.stack([jnp.stack(folded[er][tr][ec]) for tr in (0, 1)]) for ec in (0, 1)]
-                )
-                for er in (0, 1)
-            ]
-        )
-        grid = np.arange(len(target.origin))
-        # Absolute upsampled positions of the targets, and the parents they begin at.
-        first = (grid >> level) + target.origin
-        parent_origin = (grid >> (level + 1)) + source.origin
-        blocks = []
-        for row_class in (0, 1):
-            row_count = (target.size - row_class + 1) // 2
-            rows, row_even = self._parents(
-                first + row_class, parent_origin, source.size, row_count, 0
-            )
-            line = []
-            for column_class in (0, 1):
-                count = (target.size - column_class + 1) // 2
-                columns, even = self._parents(
-                    first + column_class, parent_origin, source.size, count, 1
-                )
-                taken = self._take(x, rows, columns, row_count + 1, count + 1, source.size)
-                # The four taps side by side make one product: (4 in, out).
-                corners = [
-                    taken[:, i : i + row_count, j : j + count] for i in (0, 1) for j in (0, 1)
-                ]
-                kernel = kernels[row_even, even].reshape(-1, weights.shape[-1])
-                line.append(self._product(jnp.concatenate(corners, axis=-1), kernel))
-            blocks.append(_interleave(line[0], line[1], 2, target.size))
-        return _interleave(blocks[0], blocks[1], 1, target.size)
-
-    def _parents(
-        self, positions: np.ndarray, origin: np.ndarray, size: int, count: int, axis: int
-    ) -> tuple[Array, Array]:
-        """Where in the parents' window the pairs of every second position begin, and its parity."""
-        starts = ((positions - 1) >> 1) - origin
-        phase = self.phase[axis]
-        return jnp.asarray(starts)[phase], jnp.asarray(1 - (positions & 1))[phase]
-
-    def _take(
-        self, x: Array, row: Array, column: Array, rows: int, columns: int, size: int
-    ) -> Array:
-        """A part of a window that may begin before it or end after it, where it is zero."""
-        pad = max(rows, columns)
-        x = jnp.pad(x, ((0, 0), (pad, pad), (pad, pad), (0, 0)))
-        return lax.dynamic_slice(
-            x, (0, row + pad, column + pad, 0), (x.shape[0], rows, columns, x.shape[3])
-        )
+        slices = [lax.index_in_dim(x, i, along, keepdims=False) for i in range(x.shape[along])]
+        rows = []
+        for row in np.moveaxis(matrices, 0, -1).astype(x.dtype):
+            total = None
+            for weights, piece in zip(row, slices, strict=True):
+                if not weights.any():
+                    continue
+                if (weights != weights[0]).any():
+                    piece = jnp.asarray(weights)[self.phase[axis]] * piece
+                elif weights[0] != 1:
+                    piece = weights[0] * piece
+                total = piece if total is None else total + piece
+            rows.append(jnp.zeros_like(slices[0]) if total is None else total)
+        return jnp.stack(rows)
 
     def _move(self, x: Array, source: Window, target: Window) -> Array:
         """A window cut out of another, zero where they do not overlap."""
@@ -226,15 +152,14 @@ class Sweep:
             low = max(0, -int(shift.min()))
             high = max(0, int(shift.max()) + target.size - source.size)
             widths = [(0, 0)] * x.ndim
-            widths[axis + 1] = (low, high)
+            widths[axis] = (low, high)
             x = jnp.pad(x, widths)
             start = jnp.asarray(shift + low)[self.phase[axis]]
             if (shift == shift[0]).all():
-                x = lax.slice_in_dim(
-                    x, int(shift[0]) + low, int(shift[0]) + low + target.size, axis=axis + 1
-                )
+                first = int(shift[0]) + low
+                x = lax.slice_in_dim(x, first, first + target.size, axis=axis)
             else:
-                x = lax.dynamic_slice_in_dim(x, start, target.size, axis + 1)
+                x = lax.dynamic_slice_in_dim(x, start, target.size, axis)
         return x
 
     def _pool(self, index: int, node: g.MaxPool, window: Window, x: Array) -> Array:
@@ -243,13 +168,12 @@ class Sweep:
         grid = np.arange(len(window.origin))
         start = 2 * ((grid >> level) + window.origin) - (grid >> (level - 1))
         x = self._move(x, self._window(node.source), Window(start, 2 * window.size))
-        batch, _, _, channels = x.shape
         s = window.size
-        cells = x.reshape(batch, s, 2, s, 2, channels)
+        cells = x.reshape(s, 2, s, 2, *x.shape[2:])
         codes = self._around(self.kept[index], index, window)
         total = None
         for code in range(4):
-            part = self._scale(cells[:, :, code // 2, :, code % 2], codes == code)
+            part = self._scale(cells[:, code // 2, :, code % 2], codes == code)
             total = part if total is None else total + part
         assert total is not None
         return total
@@ -261,29 +185,34 @@ class Sweep:
         kept = self.kept[index]
         wide = filtered(window, node)
         weights = self._around(kept.weights, index, window)[..., None]
-        around = g.patches(self._around(kept.image, index, wide), node.size)
+        around = self._patches(self._around(kept.image, index, wide), node.size)
         away = weights * (around - self._around(kept.result, index, window)[..., None, :])
         parts = []
         if node.image in values:
             image = self._per_cell(self._read(values, wide, node.image))
-            parts.append((weights[:, None] * g.patches(image, node.size)).sum(-2))
+            parts.append((weights[:, :, None] * self._patches(image, node.size)).sum(-2))
         if node.logits in values:
             logits = self._per_cell(self._read(values, window, node.logits))
-            product = jnp.einsum("nhwtc,ndhwt->ndhwc", away, logits, precision=self.precision)
+            product = jnp.einsum("hwntc,hwdnt->hwdnc", away, logits, precision=self.precision)
             parts.append(product)
         total = parts[0] if len(parts) == 1 else parts[0] + parts[1]
-        return total.reshape(-1, *total.shape[2:])
+        return total.reshape(*total.shape[:2], -1, total.shape[-1])
+
+    def _patches(self, x: Array, size: int) -> Array:
+        """`graph.patches` of (rows, columns, ..., c): (rows, columns, ..., taps, c)."""
+        taken = g.patches(jnp.moveaxis(x, (0, 1), (-3, -2)), size)
+        return jnp.moveaxis(taken, (-4, -3), (0, 1))
 
     def _per_cell(self, x: Array) -> Array:
-        """(cells·3, ...) as (cells, 3, ...)."""
-        return x.reshape(self.cells[0].shape[0], -1, *x.shape[1:])
+        """(..., 3·cells, c) as (..., 3, cells, c)."""
+        return x.reshape(*x.shape[:-2], 3, -1, x.shape[-1])
 
     def _slope(self, index: int, window: Window) -> Array:
         """What the primal pass kept of a pointwise layer, 0 or False beyond the image."""
         return self._around(self.kept[index], index, window)
 
     def _around(self, kept: Array, index: int, window: Window) -> Array:
-        """What the primal pass kept, with its `surround`, in every cell's window: (cells, s, s, C)."""
+        """What the primal pass kept, with its surround, in every cell's window: (s, s, cells, C)."""
         level, s = self.plan.levels[index], window.size
         step = self.plan.period >> level
         corner = [
@@ -291,25 +220,13 @@ class Sweep:
             for phase, cell in zip(self.phase, self.cells, strict=True)
         ]
         cut = functools.partial(lax.dynamic_slice, slice_sizes=(s, s, kept.shape[-1]))
-        return jax.vmap(lambda row, column: cut(kept, (row, column, 0)))(*corner)
+        return jax.vmap(lambda row, column: cut(kept, (row, column, 0)), out_axes=2)(*corner)
 
     def _scale(self, x: Array, slope: Array) -> Array:
         """The tangents of every cell times a slope, or where it is a mask, kept."""
-        split, slope = self._per_cell(x), slope[:, None]
+        split, slope = self._per_cell(x), slope[:, :, None]
         scaled = jnp.where(slope, split, 0) if slope.dtype == bool else slope * split
         return scaled.reshape(x.shape)
-
-
-def _interleave(first: Any, second: Any, axis: int, size: int) -> Array:
-    """first[0], second[0], first[1], ...: `size` of them."""
-    if first.shape[axis] > second.shape[axis]:
-        widths = [(0, 0)] * second.ndim
-        widths[axis] = (0, 1)
-        second = jnp.pad(second, widths)
-    stacked = jnp.stack([first, second], axis=axis + 1)
-    shape = list(first.shape)
-    shape[axis] *= 2
-    return lax.slice_in_dim(stacked.reshape(shape), 0, size, axis=axis)
 
 
 def margin(window: Window) -> int:

@@ -15,14 +15,14 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from progden_jax.denoisers import graph as g
-from progden_jax.divergence._sweep import Sweep, filtered, margin
-from progden_jax.divergence.windows import Plan, Window
+from progden_jax.divergence._sweep import Prepared, Sweep, filtered, margin
+from progden_jax.divergence.windows import Part, Plan, Window, convolutions
 
 
-def surround(plan: Plan, kept: dict[int, Any]) -> dict[int, Any]:
-    """What the primal pass kept, wherever windows are, with a margin that lets no tangent through.
+def prepare(plan: Plan, params: Any, kept: dict[int, Any]) -> Prepared:
+    """What sweeps need: made once, not per chunk, for at 1080p OIDN's masks are half a GiB.
 
-    Made once, not per chunk: at 1080p OIDN's masks are half a GiB.
+    `kept` is what `graph.evaluate` gives.
     """
     found = {}
     for index, arrays in kept.items():
@@ -38,7 +38,31 @@ def surround(plan: Plan, kept: dict[int, Any]) -> dict[int, Any]:
         else:
             # A pooling's codes are 0 to 3: with 4 none of four has won.
             found[index] = _surround(arrays, window, 4 if isinstance(node, g.MaxPool) else 0)
-    return found
+    kernels = {
+        index: [_at_points(part, jnp.asarray(params[node.layer]["kernel"])) for part in parts]
+        for index, (node, parts) in convolutions(plan, params).items()
+    }
+    return Prepared(found, kernels)
+
+
+def _at_points(part: Part, kernel: Array) -> Array:
+    points = jnp.asarray(part.axis.points, kernel.dtype)
+    exactly = lax.Precision.HIGHEST
+    return jnp.einsum(
+        "apj,bqi,ijcf->abpqcf", points, points, kernel[:, :, part.channels], precision=exactly
+    )
+
+
+def _of_phase(plan: Plan, params: Any, prepared: Prepared, place: tuple[Array, Array]) -> Prepared:
+    def taken(part: Part, kernel: Array) -> Array:
+        row, column = (jnp.asarray(part.axis.kind)[phase] for phase in place)
+        return kernel[column, row]
+
+    kernels = {
+        index: [taken(*both) for both in zip(parts, prepared.kernels[index], strict=True)]
+        for index, (_, parts) in convolutions(plan, params).items()
+    }
+    return prepared._replace(kernels=kernels)
 
 
 def _surround(array: Array, window: Window, outside: int) -> Array:
@@ -59,11 +83,11 @@ def jacobian_diagonal(
 
     `kept` is what `graph.evaluate` gives.
     """
-    kept = surround(plan, kept)
+    prepared = prepare(plan, params, kept)
     count = cells_per_phase(plan, size)
     rows = lax.map(
         lambda phase: some_cells(
-            plan, params, kept, size, phase, 0, count, chunk=chunk, precision=precision
+            plan, params, prepared, size, phase, 0, count, chunk=chunk, precision=precision
         ),
         jnp.arange(plan.period**2),
     )
@@ -85,7 +109,7 @@ def cells_per_phase(plan: Plan, size: tuple[int, int]) -> int:
 def some_cells(
     plan: Plan,
     params: Any,
-    surrounded: dict[int, Any],
+    prepared: Prepared,
     size: tuple[int, int],
     phase: Array,
     first: Array | int,
@@ -101,14 +125,14 @@ def some_cells(
     chunk, last = min(chunk, number), cells_per_phase(plan, size) - 1
     numbers = first + jnp.arange(-(-number // chunk) * chunk)
     cells = jnp.minimum(numbers, last).reshape(-1, chunk)
-    found = these_cells(plan, params, surrounded, size, phase, cells, precision=precision)
+    found = these_cells(plan, params, prepared, size, phase, cells, precision=precision)
     return found[:number]
 
 
 def these_cells(
     plan: Plan,
     params: Any,
-    surrounded: dict[int, Any],
+    prepared: Prepared,
     size: tuple[int, int],
     phase: Array,
     cells: Int[Array, "chunks chunk"],
@@ -117,10 +141,11 @@ def these_cells(
 ) -> Float[Array, "cells 3"]:
     """The diagonal at the pixels of a phase with these numbers, a chunk of them at once."""
     across, place = size[1] // plan.period, (phase // plan.period, phase % plan.period)
+    prepared = _of_phase(plan, params, prepared, place)
 
     def some(cells: Array) -> Array:
         split = (cells // across, cells % across)
-        sweep = Sweep(plan, params, surrounded, place, split, precision)
+        sweep = Sweep(plan, params, prepared, place, split, precision)
         return jnp.diagonal(sweep.run(), axis1=1, axis2=2)
 
     return lax.map(some, cells).reshape(-1, 3)
@@ -138,7 +163,7 @@ def replaced_where_largest(
     precision: Any,
 ) -> Float[Array, "h w 3"]:
     """The diagonal with this plan's at a share of the pixels: of each phase those of the largest weight."""
-    kept, period = surround(plan, kept), plan.period
+    prepared, period = prepare(plan, params, kept), plan.period
     size = weight.shape[0], weight.shape[1]
     rows, columns = size[0] // period, size[1] // period
     count = chosen_per_phase(plan, size, share)
@@ -150,7 +175,7 @@ def replaced_where_largest(
     def of_phase(phase: Array) -> tuple[Array, Array]:
         cells = lax.top_k(by_phase[phase], count)[1]
         padded = jnp.pad(cells, (0, -count % chunk), mode="edge").reshape(-1, chunk)
-        found = these_cells(plan, params, kept, size, phase, padded, precision=precision)
+        found = these_cells(plan, params, prepared, size, phase, padded, precision=precision)
         return cells, found[:count]
 
     phases = jnp.arange(period**2)

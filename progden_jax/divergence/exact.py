@@ -22,11 +22,10 @@ ALGORITHMS = ("auto", "basis", "coloring", "cone")
 COLORS_AT_ONCE = 4
 """Tangents at once, by unit vectors and colours, unless `chunk` says otherwise."""
 
-TIME_PER_PASS = {"basis": 1.0, "coloring": 1.0, "cone": 1.55}
-"""Time of one pass by `Exact.cost`, in forward passes. Products of small windows are slower than those of
-whole images, and zeros around growing windows are computed too: 590 forward passes of time for 383 with
-OIDN's base network at 256×256, 310 for 197 with KPCN (experiments/divergence, on a CPU; not measured on
-GPUs)."""
+TIME_PER_PASS = {"basis": 1.0, "coloring": 1.0, "cone": 2.3}
+"""Time of one pass by `Exact.cost`, in forward passes. Products of small windows and the sums around them
+are slower than whole images' convolutions: with OIDN's base network at 256×256 189 passes take the processor
+time of 420 forward passes (experiments/divergence, on a CPU; not measured on GPUs)."""
 
 logger = logging.getLogger(__name__)
 
@@ -47,8 +46,8 @@ class Exact:
             upsampling and all that does not depend on x are followed. Where it cannot be found, an error
             names the primitive that hinders it: give `reach`, or use "basis".
         "cone": through windows of a few pixels in a network whose layers f shows (``f.layered``, as those of
-            `progden_jax.denoisers` do): about 400 forward passes for OIDN's base network and 200 for
-            the project's KPCN, at any size.
+            `progden_jax.denoisers` do): the operations of about 190 forward passes for OIDN's base network
+            and 90 for the project's KPCN, at any size.
         "auto": the quickest of those that apply, as `time` expects it; `cost` counts operations.
     reach : (radius, alignment) in pixels for "coloring": f(x)_q depends on x_p only within that radius, in
         a way that repeats at the alignment. None: as f says of itself (``f.receptive_radius``), or found.

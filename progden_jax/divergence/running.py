@@ -171,7 +171,7 @@ class _ByCone:
         exact.check_layered(f)
         self.nodes = tuple(f.layers[0])
         run = _closed(_cone_primal, f)
-        self.value, self.slope, self.kept, self.params, inputs, inside = run(f, x)
+        self.value, self.slope, self.prepared, self.params, inputs, inside = run(f, x)
         extent = [] if inside is None else inside
         self.key = fingerprint(
             _checkpoint.FORMAT, "cone", repr(self.nodes), self.params, inputs, extent
@@ -189,7 +189,7 @@ class _ByCone:
         rows = np.asarray(
             _cone_step(
                 self.params,
-                self.kept,
+                self.prepared,
                 np.int32(phase),
                 np.int32(first),
                 nodes=self.nodes,
@@ -249,14 +249,15 @@ def _compiled(run: Callable[..., Any]) -> Callable[..., Any]:
 def _cone_primal(f: Any, x: Array) -> tuple[Any, ...]:
     layered: graph.Layered = f.layered(x)
     value, slope, kept = exact.cone_primal(layered, x)
-    kept = cone.surround(windows.plan(layered.nodes, layered.params), kept)
-    return value, slope, kept, layered.params, layered.inputs, layered.inside
+    plan = windows.plan(layered.nodes, layered.params)
+    prepared = cone.prepare(plan, layered.params, kept)
+    return value, slope, prepared, layered.params, layered.inputs, layered.inside
 
 
 @functools.partial(jax.jit, static_argnames=("nodes", "size", "number", "chunk"))
 def _cone_step(
     params: Any,
-    kept: dict[int, Array],
+    prepared: cone.Prepared,
     phase: Array,
     first: Array,
     *,
@@ -268,7 +269,7 @@ def _cone_step(
     return cone.some_cells(
         windows.plan(nodes, params),
         params,
-        kept,
+        prepared,
         size,
         phase,
         first,

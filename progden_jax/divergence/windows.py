@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from progden_jax.denoisers import graph as g
+from progden_jax.divergence import _short
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,48 +133,62 @@ def _union(spans: Sequence[np.ndarray | None]) -> np.ndarray | None:
 
 
 def multiply_adds(plan: Plan, params: Any) -> float:
-    """Multiply-adds of the tangent pass per pixel, all three channels, without those on padding: what `auto`
-    compares."""
+    """Of the tangent pass's convolutions per pixel, all three channels: what `auto` compares."""
     total = 0.0
-    for index, node in enumerate(plan.nodes):
-        window = plan.windows[index]
-        if not isinstance(node, g.Conv) or window is None:
-            continue
-        kernel = params[node.layer]["kernel"]
-        for source, part in zip(node.sources, split_channels(plan, params, node), strict=True):
-            origin = plan.windows[source]
-            if origin is None:
-                continue
-            if isinstance(plan.nodes[source], g.Upsample):
-                taps = (window.size * (kernel.shape[0] + 1) // 2) ** 2
-            elif shifting(origin, window):
-                taps = (kernel.shape[0] * min(origin.size, window.size)) ** 2
-            else:
-                taps = sum(_overlap(origin, window, tap) for tap in _taps(kernel.shape[0])) ** 2
-            total += (
-                3 * taps * part.stop * kernel.shape[3] - 3 * taps * part.start * kernel.shape[3]
-            )
+    for node, parts in convolutions(plan, params).values():
+        features = params[node.layer]["kernel"].shape[3]
+        for part in parts:
+            channels = part.channels.stop - part.channels.start
+            total += 3 * part.axis.multiply_adds(channels, features)
     return total
 
 
-def split_channels(plan: Plan, params: Any, node: g.Conv) -> list[slice]:
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """What a convolution takes from one of those of its sources that tangents come through."""
+
+    source: int
+    """The node whose window it reads: of an upsampled one the node below."""
+    channels: slice
+    """Of the kernel's inputs."""
+    axis: _short.Axis
+
+
+def convolutions(plan: Plan, params: Any) -> dict[int, tuple[g.Conv, list[Part]]]:
+    """How each convolution with a window is computed, by its node's index."""
+    found = {}
+    for index, node in enumerate(plan.nodes):
+        window = plan.windows[index]
+        if isinstance(node, g.Conv) and window is not None:
+            split = zip(node.sources, _split_channels(plan, params, node), strict=True)
+            parts = [_part(plan, params, index, source, channels) for source, channels in split]
+            found[index] = (node, [part for part in parts if part is not None])
+    return found
+
+
+def _part(plan: Plan, params: Any, index: int, source: int, channels: slice) -> Part | None:
+    node, window = plan.nodes[index], plan.windows[index]
+    assert isinstance(node, g.Conv)
+    assert window is not None
+    taps = params[node.layer]["kernel"].shape[0]
+    above, level = plan.nodes[source], plan.levels[index]
+    if isinstance(above, g.Upsample):
+        source = above.source
+    read = plan.windows[source]
+    if read is None:
+        return None
+    if isinstance(above, g.Upsample):
+        phases = np.arange(len(window.origin))
+        first, parent = (phases >> level) + window.origin, (phases >> (level + 1)) + read.origin
+        axis = _short.upsampled_convolution(read.size, window.size, first, parent, taps)
+    else:
+        shift = window.origin - read.origin - taps // 2
+        axis = _short.convolution(read.size, window.size, shift, taps)
+    return Part(source, channels, axis)
+
+
+def _split_channels(plan: Plan, params: Any, node: g.Conv) -> list[slice]:
     """The input channels of a convolution that belong to each of its sources."""
     widths = g.channels(plan.nodes, params)
     ends = np.cumsum([widths[source] for source in node.sources])
     return [slice(int(e) - widths[s], int(e)) for e, s in zip(ends, node.sources, strict=True)]
-
-
-def _taps(size: int) -> range:
-    return range(-(size // 2), size // 2 + 1)
-
-
-def shifting(source: Window, target: Window) -> bool:
-    """Whether the offset between two windows differs between phases."""
-    shifts = target.origin - source.origin
-    return bool((shifts != shifts[0]).any())
-
-
-def _overlap(source: Window, target: Window, tap: int) -> int:
-    """How many target pixels o read a source pixel o + tap, for windows at one offset in every phase."""
-    shift = int(target.origin[0] - source.origin[0]) + tap
-    return max(min(target.size, source.size - shift) - max(0, -shift), 0)
