@@ -5,6 +5,7 @@ import logging
 import os
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -183,24 +184,37 @@ class _ByCone:
         self.found = np.zeros((self.total, 3), x.dtype)
         self.chunk = min(method.chunk or exact.cone_chunk(), self.cells)
         self.number = min(_CHUNKS_PER_STEP * self.chunk, self.cells)
+        self.workers = 1
 
     def advance(self, done: int) -> int:
-        phase, first = divmod(done, self.cells)
-        rows = np.asarray(
-            _cone_step(
-                self.params,
-                self.prepared,
-                np.int32(phase),
-                np.int32(first),
-                nodes=self.nodes,
-                size=self.size,
-                number=self.number,
-                chunk=self.chunk,
-            )
+        """The first step, which compiles, alone; then as many at once as keep the machine busy."""
+        starts = [done]
+        while len(starts) < self.workers and (end := self._end(starts[-1])) < self.total:
+            starts.append(end)
+        with ThreadPoolExecutor(self.workers) as pool:
+            for start, rows in zip(starts, pool.map(self._step, starts), strict=True):
+                end = self._end(start)
+                self.found[start:end] = rows[: end - start]
+        self.workers = _steps_at_once()
+        return self._end(starts[-1])
+
+    def _end(self, start: int) -> int:
+        """Where a step ends: with its phase at the latest."""
+        return min(start + self.number, (start // self.cells + 1) * self.cells)
+
+    def _step(self, start: int) -> np.ndarray:
+        phase, first = divmod(start, self.cells)
+        rows = _cone_step(
+            self.params,
+            self.prepared,
+            np.int32(phase),
+            np.int32(first),
+            nodes=self.nodes,
+            size=self.size,
+            number=self.number,
+            chunk=self.chunk,
         )
-        rows = rows[: self.cells - first]
-        self.found[done : done + len(rows)] = rows
-        return done + len(rows)
+        return np.asarray(rows)
 
     def diagonal(self) -> Any:
         whole = cone.assemble(self.found, self.size, self.plan.period)
@@ -232,6 +246,11 @@ class _ByColors:
 
     def diagonal(self) -> Any:
         return self.found
+
+
+def _steps_at_once() -> int:
+    """The small products of a step keep but one core busy."""
+    return len(os.sched_getaffinity(0)) if jax.default_backend() == "cpu" else 1
 
 
 def _closed(run: Callable[..., Any], f: Any) -> Callable[..., Any]:
