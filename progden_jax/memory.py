@@ -12,8 +12,6 @@ from typing import Any
 
 import jax
 
-from progden_jax import tiling
-
 UNITS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "ki": 2**10, "mi": 2**20, "gi": 2**30}
 
 SLACK = 1.15
@@ -95,46 +93,40 @@ def trim() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def window_edge(
+def window_shape(
     available: float,
-    smallest: int,
-    needs: Callable[[int], Any],
+    choose: Callable[[float], tuple[int, int]],
+    needs: Callable[[tuple[int, int]], Any],
     guess: float,
-) -> int:
-    """The edge of the largest square window whose program fits into so many bytes.
+) -> tuple[int, int]:
+    """A window whose program fits into so many bytes.
 
     Parameters
     ----------
     available : bytes for one window's program: its arguments, results and temporaries.
-    smallest : the least edge that is of use.
-    needs : the compiled program for a window of that edge, as `jax.stages.Compiled`.
+    choose : the window to take of at most so many pixels, or the least.
+    needs : the compiled program for a window of that shape, as `jax.stages.Compiled`.
     guess : bytes per pixel to start from; too many costs speed, too few a second compilation.
 
     Raises
     ------
     ValueError
-        If not even the smallest window fits.
+        If not even the least window fits.
     """
-    edges = tiling.window_edges(smallest)
-
-    def largest(bytes_per_pixel: float) -> int:
-        fitting = [n for n in edges if n * n * bytes_per_pixel * SLACK <= available]
-        return fitting[-1] if fitting else smallest
-
-    edge = largest(guess)
+    shape = choose(available / (guess * SLACK))
     while True:
-        per_pixel = bytes_of(needs(edge)) / edge**2
+        area, needed = math.prod(shape), bytes_of(needs(shape)) * SLACK
         trim()
-        if edge**2 * per_pixel * SLACK <= available:
-            return edge
-        if edge == smallest:
-            least = math.ceil(edge**2 * per_pixel * SLACK)
+        if needed <= available:
+            return shape
+        smaller = choose(min(area * available / needed, area - 1))
+        if math.prod(smaller) >= area:
             raise ValueError(
                 f"max_memory leaves {shown(max(available, 0))} for a window, and the least, of "
-                f"{edge}×{edge} pixels, takes {shown(least)}: give at least "
-                f"{shown(least - available)} more, or a smaller network."
+                f"{shape[0]}×{shape[1]} pixels, takes {shown(needed)}: give at least "
+                f"{shown(needed - available)} more, or a smaller network."
             )
-        edge = min(largest(per_pixel), edges[edges.index(edge) - 1])
+        shape = smaller
 
 
 def bytes_of(compiled: Any) -> int:
