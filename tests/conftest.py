@@ -22,12 +22,14 @@ DEMO = Path(pd.__file__).parent / "data" / "demo"
 # `metrics.flip` sets it too, but too late where a test imports FLIP first: its threads spin for 0.1 s a call.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-# Next to nothing of what is imported for the tests is garbage, and looking takes seconds.
+# Next to nothing of what is imported for the tests is garbage, and little of what JAX traces: looking takes
+# seconds, so it is done rarely.
 gc.disable()
 
 
 def pytest_collection_finish():
     gc.freeze()
+    gc.set_threshold(10_000)
     gc.enable()
 
 
