@@ -3,6 +3,7 @@
 import functools
 import gc
 import os
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,6 +17,12 @@ import pytest
 import progden_jax as pd
 from progden_jax.compilation import counting_compilations as counting_compilations
 from progden_jax.denoisers import unet
+
+with pytest.MonkeyPatch.context() as without:
+    # Both import PyTorch where there is one: seconds in every process, for nothing that is tested.
+    without.setitem(sys.modules, "torch", None)
+    import pyoidn  # noqa: F401
+    import tensorboardX  # noqa: F401
 
 DEMO = Path(pd.__file__).parent / "data" / "demo"
 

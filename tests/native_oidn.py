@@ -7,17 +7,11 @@ for: setting them to SSE4 beforehand is what a processor without AMX would give.
 
 import ctypes
 import functools
-import sys
 from pathlib import Path
 
 import numpy as np
-import pytest
+import pyoidn
 from elftools.elf.elffile import ELFFile
-
-with pytest.MonkeyPatch.context() as patch:
-    # It imports PyTorch where there is one, which takes seconds.
-    patch.setitem(sys.modules, "torch", None)
-    import pyoidn
 
 _SSE4 = 3  # In ISPC's numbering of targets.
 
