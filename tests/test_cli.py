@@ -956,7 +956,7 @@ def test_time_left_is_told_while_a_percent_takes_minutes():
 
 @pytest.fixture
 def interruptible():
-    """SIGINT raises in this thread, as in a shell's foreground: pytest's workers ignore it."""
+    """SIGINT raises in this thread, though what runs in a shell's background inherits that it is ignored."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
