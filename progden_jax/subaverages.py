@@ -8,6 +8,7 @@ import itertools
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -56,10 +57,20 @@ def averaged(frames: Sequence[Frame], *, names: Sequence[str] = ()) -> SubAverag
     if not frames:
         raise ValueError("there are no frames: give the sub-averages of a render.")
     _check_images(frames, names or [f"frames[{n}]" for n in range(len(frames))])
-    count, known = len(frames), all(frame.spp is not None for frame in frames)
-    spp = jnp.stack([jnp.asarray(f.spp, jnp.float32) for f in frames]) if known else None
+    if all(frame.spp is not None for frame in frames):
+        return _averaged(list(frames), None)
     # Not of JAX where nothing is known, so that it can be looked at under `jit`.
-    shares: Any = np.full(count, 1 / count, np.float32) if spp is None else spp / spp.sum()
+    shares: Any = np.full(len(frames), 1 / len(frames), np.float32)
+    return _averaged(list(frames), shares)._replace(shares=shares)
+
+
+@jax.jit
+def _averaged(frames: list[Frame], shares: Array | None) -> SubAverages:
+    """By the samples per pixel where no shares are given."""
+    count, spp = len(frames), None
+    if shares is None:
+        spp = jnp.stack([jnp.asarray(frame.spp, jnp.float32) for frame in frames])
+        shares = spp / spp.sum()
     sound = [repaired(frame) for frame in frames]
     means, differences = {}, {}
     for name in _DIFFERING:

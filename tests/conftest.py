@@ -3,6 +3,7 @@
 import functools
 import gc
 import os
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,17 +18,25 @@ import progden_jax as pd
 from progden_jax.compilation import counting_compilations as counting_compilations
 from progden_jax.denoisers import unet
 
+with pytest.MonkeyPatch.context() as without:
+    # Both import PyTorch where there is one: seconds in every process, for nothing that is tested.
+    without.setitem(sys.modules, "torch", None)
+    import pyoidn  # noqa: F401
+    import tensorboardX  # noqa: F401
+
 DEMO = Path(pd.__file__).parent / "data" / "demo"
 
 # `metrics.flip` sets it too, but too late where a test imports FLIP first: its threads spin for 0.1 s a call.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-# Next to nothing of what is imported for the tests is garbage, and looking takes seconds.
+# Next to nothing of what is imported for the tests is garbage, and little of what JAX traces: looking takes
+# seconds, so it is done rarely.
 gc.disable()
 
 
 def pytest_collection_finish():
     gc.freeze()
+    gc.set_threshold(10_000)
     gc.enable()
 
 

@@ -414,7 +414,13 @@ def chosen(renders, **changes):
 @pytest.fixture(scope="module")
 def trainer(renders, tmp_path_factory):
     """Behind a denoiser that blurs and dims."""
-    how = {"steps": 30, "evaluate_every": 30, "peak_rate": 0.03, "loss": "log-relmse"}
+    how = {
+        "steps": 30,
+        "evaluate_every": 30,
+        "checkpoint_every": 30,
+        "peak_rate": 0.03,
+        "loss": "log-relmse",
+    }
     how = chosen(renders, options={"layers": 1, "layer_size": 3, "window": 3}, **how)
     cache = tmp_path_factory.mktemp("cache")
     return Trainer(CombinerTask(how, denoiser=COLUMN, cache_folder=cache))

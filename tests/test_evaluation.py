@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 import report_run
 import toy_denoisers
-from code_generation import users_environment
 from conftest import counting_compilations
 from evaluation_runs import REFERENCE, TOY, Remembers, write_series
 
@@ -503,7 +502,7 @@ def test_killed_at_any_moment_it_keeps_what_it_had(renders, tmp_path):
     ]
     process = subprocess.Popen(
         [sys.executable, "-m", "progden_jax", *words, "--methods", "render", "denoised"],
-        env=users_environment() | {"PROGDEN_CACHE": str(tmp_path / "cache")},
+        env=os.environ | {"PROGDEN_CACHE": str(tmp_path / "cache")},
         stdout=subprocess.DEVNULL,
     )
     try:

@@ -2,7 +2,9 @@
 
 import dataclasses
 import difflib
+import functools
 from collections.abc import Collection, Mapping
+from types import MappingProxyType
 from typing import Any, Literal
 
 from progden_jax import _checks
@@ -160,7 +162,8 @@ def _inner(prefix: str, settings: Settings) -> dict[str, Any]:
     }
 
 
-def names() -> dict[str, Any]:
+@functools.cache
+def names() -> Mapping[str, Any]:
     """The names of all settings, with their defaults."""
     inner = {field for field, _ in _GROUPS.values()}
     usual = Settings()
@@ -169,7 +172,7 @@ def names() -> dict[str, Any]:
     }
     for prefix in _GROUPS:
         found |= _inner(prefix, usual)
-    return found
+    return MappingProxyType(found)
 
 
 def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -161,7 +161,10 @@ def split(rows: Iterable[Row], setting: str) -> dict[Any, list[Row]]:
     """
     rows = list(rows)
     values = dict.fromkeys(row.settings[setting] for row in rows if setting in row.settings)
-    relabelled = [row._replace(method=_label(row, setting)) for row in rows]
+    # Parsing takes long, and most rows share their settings with others.
+    alike = {(row.method, repr(row.settings)): row for row in rows}
+    labels = {key: _label(row, setting) for key, row in alike.items()}
+    relabelled = [row._replace(method=labels[row.method, repr(row.settings)]) for row in rows]
     return {
         value: [row for row in relabelled if row.settings.get(setting, value) == value]
         for value in values

@@ -76,7 +76,7 @@ class Trainer:
         self._key = jax.device_put(jax.random.key(task.config.seed), self._everywhere)
         self._start = make_start(task)
         self._step = make_step(task, mesh if len(devices) > 1 else None)
-        self._rate = schedule(task.config)
+        self._rate = jax.jit(schedule(task.config))
         self._metadata = {
             "commit": commit(),
             "version": progden_jax.__version__,
