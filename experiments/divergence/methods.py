@@ -36,8 +36,8 @@ TRUNCATED = {
     16: pd.TruncatedCone(levels=1, whole=1 / 16),
     64: pd.TruncatedCone(levels=3, whole=1 / 20),
 }
-"""By the number of probes that takes as many operations or more, with OIDN's base network; the exact divergence
-itself takes fewer than 256."""
+"""By the number of probes that takes as many operations or more, with OIDN's base network; the exact
+divergence itself takes fewer than 256."""
 
 HEADER = (
     *("denoiser", "scene", "spp", "method", "probes", "passes", "seconds"),

@@ -33,47 +33,58 @@ _FINITE = {
 
 @dataclasses.dataclass(frozen=True)
 class Axis:
-    """How a window is convolved along one axis, at every phase."""
+    """How a window is convolved along one axis, at every phase: in tiles, where it is long."""
 
     spread: np.ndarray
-    """From source pixels to points, (phases, tiles · points, source)."""
+    """From a tile's source pixels to points, (phases, points, pixels)."""
     points: np.ndarray
-    """From the kernel's taps to points, (kinds, points, taps): alike for all tiles."""
+    """From the kernel's taps to points, (kinds, points, taps)."""
     combine: np.ndarray
-    """From points to target pixels, (phases, target, tiles · points)."""
+    """From points to the tile of the target, (phases, width, points)."""
     kind: np.ndarray
     """Which of `points` a phase takes, (phases,)."""
-
-    @property
-    def tiles(self) -> int:
-        return self.spread.shape[1] // self.points.shape[1]
+    source: int
+    target: int
+    tiles: int
+    start: np.ndarray
+    """Where in the source the first tile begins, (phases,)."""
+    stride: int
+    """Source pixels from one tile to the next."""
 
     def multiply_adds(self, channels: int, features: int) -> float:
         """Of the convolution of one window along both axes."""
-        points, source = self.spread.shape[1:]
-        target = self.combine.shape[1]
-        spread, combine = (np.count_nonzero(m.any(0)) for m in (self.spread, self.combine))
+        points = self.tiles * self.spread.shape[1]
+        spread, combine = (
+            self.tiles * np.count_nonzero(m.any(0)) for m in (self.spread, self.combine)
+        )
         return (
             points**2 * channels * features
-            + spread * (source + points) * channels
-            + combine * (target + points) * features
+            + spread * (self.source + points) * channels
+            + combine * (self.target + points) * features
         )
 
 
 def convolution(source: int, target: int, shift: np.ndarray, taps: int) -> Axis:
     """y_o = Σ_t w_t x_{o + t + shift}, o below `target` and x zero beyond `source`, shift per phase."""
     tiles, width = _tiling(target, taps - 1)
-    reached = source + taps - 1
+    reached, count = source + taps - 1, len(shift)
     if (source == 1 or reached <= MOST_POINTS) and reached < tiles * (width + taps - 1):
-        values, kernel, back = _product(source, taps)
+        spread, kernel, back = _product(source, taps)
         rows = np.arange(target) + shift[:, None] + taps - 1
-        inside = (rows >= 0) & (rows < len(back))
-        combine = np.where(inside[..., None], back[np.clip(rows, 0, len(back) - 1)], 0)
-        spread = np.broadcast_to(values, (len(shift), *values.shape))
-        points = kernel[:, ::-1]
+        inside = (rows >= 0) & (rows < reached)
+        combine = np.where(inside[..., None], back[np.clip(rows, 0, reached - 1)], 0)
+        spread, points = np.broadcast_to(spread, (count, *spread.shape)), kernel[:, ::-1]
+        tiles, start = 1, np.zeros(count, int)
     else:
-        spread, points, combine = _tiled(source, target, tiles, width, shift, taps)
-    return Axis(spread, points[None], combine, np.zeros(len(shift), int))
+        gather, points, back = _correlation(width, taps)
+        combine = np.broadcast_to(back, (count, *back.shape))
+        if tiles == 1:
+            # The offset is part of the matrix.
+            spread, start = _placed(gather, shift, source), np.zeros(count, int)
+        else:
+            spread, start = np.broadcast_to(gather, (count, *gather.shape)), shift
+    kind = np.zeros(count, int)
+    return Axis(spread, points[None], combine, kind, source, target, tiles, start, width)
 
 
 def upsampled_convolution(
@@ -84,38 +95,34 @@ def upsampled_convolution(
     `first` and `parent` are where the target and x begin, per phase. Every second pixel sees its parents
     through few taps, the sums of those that fall on one parent.
     """
-    reach = taps // 2
-    fewer = (taps + 2) // 2
+    reach, fewer = taps // 2, (taps + 2) // 2
     tiles, width = _tiling(target, 2 * (fewer - 1), step=2)
-    sizes = [(width + 1) // 2, width // 2]
+    begin = (first - reach) // 2 - parent
+    start, pixels = np.zeros(len(first), int), source
+    if tiles > 1:
+        start, pixels = begin, width // 2 + fewer
     kinds = np.unique(first % 2)
-    points, spreads, combines = [], [], []
-    for second, size in enumerate(sizes):
+    points, spread, combine = [], [], []
+    for second, size in enumerate(((width + 1) // 2, width // 2)):
         if not size:
             continue
-        begin = (first + second - reach) // 2 - parent
         gather, kernel, back = _correlation(size, fewer)
-        folds = []
+        folded = []
         for kind in kinds:
             seen = (kind + second - reach + np.arange(taps)) // 2
-            folds.append(kernel @ (seen - seen[0] == np.arange(fewer)[:, None]))
-        points.append(np.stack(folds))
-        spread = np.zeros((len(first), tiles, len(gather), source))
-        combine = np.zeros((target, tiles, len(gather)))
-        for tile in range(tiles):
-            starts = begin + tile * (width // 2)
-            spread[:, tile] = _placed(gather, starts, source)
-            rows = tile * width + second + 2 * np.arange(size)
-            combine[rows[rows < target], tile] = back[rows < target]
-        spreads.append(spread)
-        combines.append(combine)
-    spread = np.concatenate(spreads, 2).reshape(len(first), -1, source)
-    combine = np.concatenate(combines, 2).reshape(target, -1)
+            folded.append(kernel @ (seen - seen[0] == np.arange(fewer)[:, None]))
+        points.append(np.stack(folded))
+        spread.append(_placed(gather, (first + second - reach) // 2 - parent - start, pixels))
+        rows = np.zeros((width, len(gather)))
+        rows[second::2] = back
+        combine.append(rows)
+    together = np.concatenate(combine, 1)
     return Axis(
-        spread,
+        np.concatenate(spread, 1),
         np.concatenate(points, 1),
-        np.broadcast_to(combine, (len(first), *combine.shape)),
+        np.broadcast_to(together, (len(first), *together.shape)),
         np.searchsorted(kinds, first % 2),
+        *(source, target, tiles, start, width // 2),
     )
 
 
@@ -125,23 +132,6 @@ def _tiling(target: int, more: int, step: int = 1) -> tuple[int, int]:
     choices = [(1, target)] if target <= widest else []
     choices += [(math.ceil(target / width), width) for width in range(step, widest + 1, step)]
     return min(choices, key=lambda choice: choice[0] * (choice[1] + more))
-
-
-def _tiled(
-    source: int, target: int, tiles: int, width: int, shift: np.ndarray, taps: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    gather, kernel, back = _correlation(width, taps)
-    spread = [_placed(gather, shift + tile * width, source) for tile in range(tiles)]
-    combine = np.zeros((target, tiles, len(gather)))
-    for tile in range(tiles):
-        end = min(target - tile * width, width)
-        combine[tile * width : tile * width + end, tile] = back[:end]
-    combine = combine.reshape(target, -1)
-    return (
-        np.concatenate(spread, 1),
-        kernel,
-        np.broadcast_to(combine, (len(shift), *combine.shape)),
-    )
 
 
 def _placed(matrix: np.ndarray, starts: np.ndarray, width: int) -> np.ndarray:

@@ -112,18 +112,30 @@ class Sweep:
 
     def _convolve_window(self, x: Array, axis: Axis, kernel: Array) -> Array:
         """A window, (rows, columns, n, c), along columns and rows as `_short.Axis` says."""
-        tiles, points = axis.tiles, kernel.shape[0]
-        split = (tiles, points)
-        x = self._combine(axis.spread, 0, x, 0).reshape(*split, *x.shape[1:])
-        x = self._combine(axis.spread, 1, x, 2).reshape(*split, *split, *x.shape[3:])
-        # Tiles count among the windows of a batch: they share the kernel.
-        x = x.transpose(1, 3, 0, 2, 4, 5)
+        points = kernel.shape[0]
+        x = self._at_points(axis, 0, x, 0)
+        x = self._at_points(axis, 1, x, 2).swapaxes(1, 2)
+        # Tiles count among the windows of a batch: (points, points, tiles, tiles, n, c).
         shape = x.shape
         x = jnp.matmul(x.reshape(points, points, -1, shape[-1]), kernel, precision=self.precision)
-        x = x.reshape(*shape[:-1], -1).transpose(2, 0, 3, 1, 4, 5)
-        x = self._combine(axis.combine, 1, x.reshape(tiles * points, *x.shape[2:]), 0)
-        x = x.reshape(x.shape[0], tiles * points, *x.shape[3:])
-        return self._combine(axis.combine, 0, x, 1)
+        x = x.reshape(*shape[:-1], -1)
+        x = self._together(self._combine(axis.combine, 1, x, 0), 2, axis)
+        return self._together(self._combine(axis.combine, 0, x, 1), 2, axis)
+
+    def _at_points(self, axis: Axis, which: int, x: Array, along: int) -> Array:
+        """A window along an axis at a row's or a column's points, (points, tiles, ...)."""
+        if axis.tiles == 1:
+            return self._combine(axis.spread, which, x, along)[:, None]
+        width = axis.spread.shape[2]
+        x = self._cut(x, along, axis.start, (axis.tiles - 1) * axis.stride + width, which)
+        starts = range(0, axis.tiles * axis.stride, axis.stride)
+        tiles = [lax.slice_in_dim(x, start, start + width, axis=along) for start in starts]
+        return self._combine(axis.spread, which, jnp.stack(tiles), along + 1)
+
+    def _together(self, x: Array, tiles: int, axis: Axis) -> Array:
+        """Tiles, which are at an axis of their own, after each other along the first."""
+        x = jnp.moveaxis(x, tiles, 0)
+        return x.reshape(-1, *x.shape[2:])[: axis.target]
 
     def _combine(self, matrices: np.ndarray, axis: int, x: Array, along: int) -> Array:
         """The phase's matrix times x along one of its axes, which then comes first.
@@ -148,19 +160,21 @@ class Sweep:
     def _move(self, x: Array, source: Window, target: Window) -> Array:
         """A window cut out of another, zero where they do not overlap."""
         for axis in (0, 1):
-            shift = target.origin - source.origin
-            low = max(0, -int(shift.min()))
-            high = max(0, int(shift.max()) + target.size - source.size)
-            widths = [(0, 0)] * x.ndim
-            widths[axis] = (low, high)
-            x = jnp.pad(x, widths)
-            start = jnp.asarray(shift + low)[self.phase[axis]]
-            if (shift == shift[0]).all():
-                first = int(shift[0]) + low
-                x = lax.slice_in_dim(x, first, first + target.size, axis=axis)
-            else:
-                x = lax.dynamic_slice_in_dim(x, start, target.size, axis)
+            x = self._cut(x, axis, target.origin - source.origin, target.size, axis)
         return x
+
+    def _cut(self, x: Array, along: int, start: np.ndarray, length: int, axis: int) -> Array:
+        """A part of x, from where the phase's row or column says, with zeros beyond x."""
+        low = max(0, -int(start.min()))
+        high = max(0, int(start.max()) + length - x.shape[along])
+        widths = [(0, 0)] * x.ndim
+        widths[along] = (low, high)
+        x = jnp.pad(x, widths)
+        if (start == start[0]).all():
+            first = int(start[0]) + low
+            return lax.slice_in_dim(x, first, first + length, axis=along)
+        first = jnp.asarray(start + low)[self.phase[axis]]
+        return lax.dynamic_slice_in_dim(x, first, length, along)
 
     def _pool(self, index: int, node: g.MaxPool, window: Window, x: Array) -> Array:
         """Each pooled tangent is that of the value that won."""
