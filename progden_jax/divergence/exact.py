@@ -22,10 +22,11 @@ ALGORITHMS = ("auto", "basis", "coloring", "cone")
 COLORS_AT_ONCE = 4
 """Tangents at once, by unit vectors and colours, unless `chunk` says otherwise."""
 
-TIME_PER_PASS = {"basis": 1.0, "coloring": 1.0, "cone": 2.3}
+TIME_PER_PASS = {"basis": 1.0, "coloring": 1.0, "cone": 2.5}
 """Time of one pass by `Exact.cost`, in forward passes. Products of small windows and the sums around them
-are slower than whole images' convolutions: with OIDN's base network at 256×256 189 passes take the processor
-time of 420 forward passes (experiments/divergence, on a CPU; not measured on GPUs)."""
+are slower than whole images' convolutions, and leave cores idle: with OIDN's base network at 256×256 189
+passes take as long as 481 forward passes, 283 by `exact_divergence`, which runs steps side by side
+(experiments/divergence, two cores of a CPU; not measured on GPUs)."""
 
 logger = logging.getLogger(__name__)
 
