@@ -125,7 +125,9 @@ def some_cells(
     chunk, last = min(chunk, number), cells_per_phase(plan, size) - 1
     numbers = first + jnp.arange(-(-number // chunk) * chunk)
     cells = jnp.minimum(numbers, last).reshape(-1, chunk)
-    found = these_cells(plan, params, prepared, size, phase, cells, precision=precision)
+    found = these_cells(
+        *(plan, params, prepared, size, phase, cells), pixels=math.prod(size), precision=precision
+    )
     return found[:number]
 
 
@@ -137,15 +139,19 @@ def these_cells(
     phase: Array,
     cells: Int[Array, "chunks chunk"],
     *,
+    pixels: int,
     precision: Any,
 ) -> Float[Array, "cells 3"]:
-    """The diagonal at the pixels of a phase with these numbers, a chunk of them at once."""
+    """The diagonal at the pixels of a phase with these numbers, a chunk of them at once.
+
+    `pixels` is how many the program will serve in all phases.
+    """
     across, place = size[1] // plan.period, (phase // plan.period, phase % plan.period)
     prepared = _of_phase(plan, params, prepared, place)
 
     def some(cells: Array) -> Array:
         split = (cells // across, cells % across)
-        sweep = Sweep(plan, params, prepared, place, split, precision)
+        sweep = Sweep(plan, params, prepared, place, split, pixels, precision)
         return jnp.diagonal(sweep.run(), axis1=1, axis2=2)
 
     return lax.map(some, cells).reshape(-1, 3)
@@ -175,7 +181,11 @@ def replaced_where_largest(
     def of_phase(phase: Array) -> tuple[Array, Array]:
         cells = lax.top_k(by_phase[phase], count)[1]
         padded = jnp.pad(cells, (0, -count % chunk), mode="edge").reshape(-1, chunk)
-        found = these_cells(plan, params, prepared, size, phase, padded, precision=precision)
+        found = these_cells(
+            *(plan, params, prepared, size, phase, padded),
+            pixels=count * period**2,
+            precision=precision,
+        )
         return cells, found[:count]
 
     phases = jnp.arange(period**2)
