@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Array
 
 from progden_jax import memory, skipping, tiling
-from progden_jax._canvas import canvas_size
 from progden_jax._devices import on_each
 from progden_jax.frame import Frame
 from progden_jax.skipping import Skip, Skipped
@@ -66,13 +65,13 @@ def within(
     if max_memory is not None and (shape is None or not fits(job, frame, shape, max_memory)):
         pixels = frame.size[0] * frame.size[1]
         kept = _pixel_bytes(frame) * pixels * len(job.outputs)
-        canvas = (canvas_size(frame.size[0]), canvas_size(frame.size[1]))
-        shape = memory.window_shape(
+        edge = memory.window_edge(
             max_memory - kept,
-            lambda pixels: tiling.window_shape(frame.size, canvas, pixels, reach, step),
-            lambda shape: _compiled(job, frame, divergence, shape),
+            tiling.smallest_window(reach, step),
+            lambda edge: _compiled(job, frame, divergence, edge),
             _guess(job),
         )
+        shape = (edge, edge)
     assert shape is not None
     windows = list(tiling.grid(frame.size, shape, reach, step))
     return assemble(job, frame, divergence, windows, skip, on_host=True, devices=devices)
@@ -159,17 +158,17 @@ def _arguments(
     return frame_of(buffers), divergence, valid, place
 
 
-def _compiled(job: Any, frame: Frame, divergence: Array | None, shape: tuple[int, int]) -> Any:
-    """The program for windows of that shape, which depends on nothing else."""
+def _compiled(job: Any, frame: Frame, divergence: Array | None, edge: int) -> Any:
+    """The program for windows of that edge, which depends on nothing else."""
     dtype = np.dtype(frame.color.dtype)
     zeros = {
-        name: np.zeros((*shape, getattr(frame, name).shape[-1]), dtype)
+        name: np.zeros((edge, edge, getattr(frame, name).shape[-1]), dtype)
         for name in BUFFERS
         if getattr(frame, name) is not None
     }
     whole = Survey(zeros, {}, cast(Any, None), dtype.type(0), dtype.type(0))
     given = None if divergence is None else zeros["color"]
-    window = Window((0, 0), shape, (0, shape[0]), (0, shape[1]))
+    window = Window((0, 0), (edge, edge), (0, edge), (0, edge))
     exposure = exposure_of(np.zeros((1, 1, 3), dtype), job.denoiser)
     arguments = _arguments(whole, cast(Any, given), exposure, window)
     return job.program.lower(job, *arguments).compile()

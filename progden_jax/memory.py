@@ -12,6 +12,8 @@ from typing import Any
 
 import jax
 
+from progden_jax import tiling
+
 UNITS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "ki": 2**10, "mi": 2**20, "gi": 2**30}
 
 SLACK = 1.15
@@ -93,40 +95,46 @@ def trim() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def window_shape(
+def window_edge(
     available: float,
-    choose: Callable[[float], tuple[int, int]],
-    needs: Callable[[tuple[int, int]], Any],
+    smallest: int,
+    needs: Callable[[int], Any],
     guess: float,
-) -> tuple[int, int]:
-    """A window whose program fits into so many bytes.
+) -> int:
+    """The edge of the largest square window whose program fits into so many bytes.
 
     Parameters
     ----------
     available : bytes for one window's program: its arguments, results and temporaries.
-    choose : the window to take of at most so many pixels, or the least.
-    needs : the compiled program for a window of that shape, as `jax.stages.Compiled`.
+    smallest : the least edge that is of use.
+    needs : the compiled program for a window of that edge, as `jax.stages.Compiled`.
     guess : bytes per pixel to start from; too many costs speed, too few a second compilation.
 
     Raises
     ------
     ValueError
-        If not even the least window fits.
+        If not even the smallest window fits.
     """
-    shape = choose(available / (guess * SLACK))
+    edges = tiling.window_edges(smallest)
+
+    def largest(bytes_per_pixel: float) -> int:
+        fitting = [n for n in edges if n * n * bytes_per_pixel * SLACK <= available]
+        return fitting[-1] if fitting else smallest
+
+    edge = largest(guess)
     while True:
-        area, needed = math.prod(shape), bytes_of(needs(shape)) * SLACK
+        per_pixel = bytes_of(needs(edge)) / edge**2
         trim()
-        if needed <= available:
-            return shape
-        smaller = choose(min(area * available / needed, area - 1))
-        if math.prod(smaller) >= area:
+        if edge**2 * per_pixel * SLACK <= available:
+            return edge
+        if edge == smallest:
+            least = math.ceil(edge**2 * per_pixel * SLACK)
             raise ValueError(
                 f"max_memory leaves {shown(max(available, 0))} for a window, and the least, of "
-                f"{shape[0]}×{shape[1]} pixels, takes {shown(needed)}: give at least "
-                f"{shown(needed - available)} more, or a smaller network."
+                f"{edge}×{edge} pixels, takes {shown(least)}: give at least "
+                f"{shown(least - available)} more, or a smaller network."
             )
-        shape = smaller
+        edge = min(largest(per_pixel), edges[edges.index(edge) - 1])
 
 
 def bytes_of(compiled: Any) -> int:

@@ -246,31 +246,6 @@ def few_lengths(
     return lengths(canvas[0]), lengths(canvas[1])
 
 
-_WORTH_A_PROGRAM = 0.75
-
-
-def window_shape(
-    size: tuple[int, int], canvas: tuple[int, int], pixels: float, reach: int, step: int
-) -> tuple[int, int]:
-    """A window of at most so many pixels, or the least square if none is as small.
-
-    The largest square, whose program images of all sizes share; but where a `grid` of others, squares or
-    strips as high or as wide as the canvas, computes a quarter less, the one that computes least.
-    """
-    edges = window_edges(smallest_window(reach, step))
-    high, wide = (_up(n, step) for n in canvas)
-    squares = [(edge, edge) for edge in edges if edge**2 <= pixels] or [(edges[0], edges[0])]
-    strips = [(high, edge) for edge in edges] + [(edge, wide) for edge in edges]
-    found = squares + [strip for strip in strips if math.prod(strip) <= pixels]
-
-    def computed(shape: tuple[int, int]) -> int:
-        along = (len(list(_along(n, w, reach, step))) for n, w in zip(size, shape, strict=True))
-        return math.prod(shape) * math.prod(along)
-
-    best, square = min(found, key=computed), squares[-1]
-    return best if computed(best) < _WORTH_A_PROGRAM * computed(square) else square
-
-
 def smallest_window(reach: int, step: int) -> int:
     """The least edge that leaves a window a core."""
     return _up(2 * reach + 2 * step, step)

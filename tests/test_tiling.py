@@ -1,6 +1,5 @@
 """Windows: their geometry, the memory they take, and that a frame in windows is the whole frame."""
 
-import math
 from types import SimpleNamespace
 
 import jax
@@ -177,10 +176,10 @@ def test_what_is_no_size(text):
 def program_of(per_pixel):
     tried = []
 
-    def compiled(shape):
-        tried.append(math.prod(shape))
+    def compiled(edge):
+        tried.append(edge)
         sizes = SimpleNamespace(
-            temp_size_in_bytes=per_pixel * math.prod(shape),
+            temp_size_in_bytes=per_pixel * edge**2,
             argument_size_in_bytes=0,
             output_size_in_bytes=0,
         )
@@ -190,41 +189,17 @@ def program_of(per_pixel):
 
 
 def test_a_window_is_as_large_as_the_memory_allows():
-    def choose(pixels):
-        return tiling.window_shape((8000, 9000), (8192, 9216), pixels, 136, 16)
-
     compiled, tried = program_of(1000)
-    shape = memory.window_shape(10**9, choose, compiled, guess=1100)
-    assert tried == [math.prod(shape)]
-    assert 0.5 * 10**9 < tried[0] * 1000 * memory.SLACK <= 10**9
+    edge = memory.window_edge(10**9, 288, compiled, guess=1100)
+    assert tried == [edge]
+    assert 0.5 * 10**9 < edge**2 * 1000 * memory.SLACK <= 10**9
     # A guess that is too low costs another compilation, never memory.
     compiled, tried = program_of(5000)
-    assert math.prod(memory.window_shape(10**9, choose, compiled, guess=1000)) < tried[0]
-    assert tried[-1] * 5000 * memory.SLACK <= 10**9
+    assert memory.window_edge(10**9, 288, compiled, guess=1000) < tried[0]
+    assert tried[-1] ** 2 * 5000 * memory.SLACK <= 10**9
     compiled, tried = program_of(10**6)
-    with pytest.raises(ValueError, match=r"304×304 pixels, takes .* GiB: give at least"):
-        memory.window_shape(10**9, choose, compiled, guess=1000)
-
-
-def computed(size, shape, reach=106, step=16):
-    return math.prod(shape) * len(list(tiling.grid(size, shape, reach, step)))
-
-
-def test_strips_where_squares_fit_badly():
-    """At 1920×1080 squares of 896 pixels compute 4.8 million pixels, three strips of that width 2.9."""
-    size, canvas = (1080, 1920), (1088, 1920)
-    shape = tiling.window_shape(size, canvas, 10**6, 106, 16)
-    assert shape[0] == 1088 > shape[1]
-    assert math.prod(shape) <= 10**6
-    assert computed(size, shape) < 0.65 * computed(size, (896, 896))
-    # Turned by a quarter, so is the strip; where squares fit, they are shared by all sizes.
-    assert tiling.window_shape(size[::-1], canvas[::-1], 10**6, 106, 16) == shape[::-1]
-    for large in ((8000, 9000), (6000, 7777)):
-        assert tiling.window_shape(large, large, 1.1 * 10**6, 106, 16) == (1024, 1024)
-    # A ribbon takes no windows that reach far beyond it.
-    assert tiling.window_shape((100, 20_000), (112, 20_480), 10**6, 106, 16)[0] == 112
-    # Nothing is as small: the least that leaves a core.
-    assert tiling.window_shape(size, canvas, 10, 106, 16) == (256, 256)
+    with pytest.raises(ValueError, match=r"288×288 pixels, takes .* GiB: give at least"):
+        memory.window_edge(10**9, 288, compiled, guess=1000)
 
 
 def test_a_survey_repairs_as_the_whole_frame_would(real_frame):
