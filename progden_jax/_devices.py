@@ -2,6 +2,7 @@
 
 import functools
 import itertools
+import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
@@ -16,6 +17,11 @@ Device = Any
 
 _AXIS = "stack"
 _SPLIT = PartitionSpec(_AXIS)
+
+
+def cores() -> list[int]:
+    """The CPU's that this process may use."""
+    return sorted(os.sched_getaffinity(0))
 
 
 def on_each(

@@ -2,7 +2,8 @@
 
 Compiling takes most of the suite's time, with these flags a third as much: the newer generator, which users
 get, takes half as long again for most programs, and optimising loops over a few pixels never pays.
-What XLA does before that is the same. What pins the compiler itself or outputs asks for `as_for_users`.
+What XLA does before that is the same. What pins the compiler itself or outputs asks for `as_for_users`,
+and commands that run as programs of their own for `users_environment`.
 """
 
 import os
@@ -38,6 +39,12 @@ def choose() -> None:
     )
     if attempt.returncode == 0:
         os.environ["XLA_FLAGS"] = flags
+
+
+def users_environment() -> dict[str, str]:
+    """The environment without the flags."""
+    given = os.environ.get("XLA_FLAGS", "").split()
+    return os.environ | {"XLA_FLAGS": " ".join(flag for flag in given if flag not in FLAGS)}
 
 
 def as_for_users() -> dict[str, bool | str]:

@@ -6,7 +6,6 @@ import json
 import os
 import re
 import resource
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -15,6 +14,7 @@ import jax
 import numpy as np
 import OpenEXR
 import pytest
+from code_generation import users_environment
 from exr_files import planes, read_channels, stack, write
 
 import progden_jax as pd
@@ -954,41 +954,49 @@ def test_time_left_is_told_while_a_percent_takes_minutes():
     assert part.time_remaining == pytest.approx(5 * (10_000 - 159), rel=1e-3)
 
 
-@pytest.fixture
-def interruptible():
-    """SIGINT raises in this thread, though what runs in a shell's background inherits that it is ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
+# As a program of its own.
 
 
-def test_an_interrupted_exact_divergence_is_resumed(
-    tmp_path, frames, progden, monkeypatch, interruptible
-):
+INTERRUPT_ITSELF = """
+import importlib, os, signal, sys
+from progden_jax.cli import main
+
+# What runs in a shell's background inherits an ignored SIGINT.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+calls = []
+
+def follow(bars, done, total):
+    calls.append(done)
+    if len(calls) == 5:
+        os.kill(os.getpid(), signal.SIGINT)
+
+importlib.import_module("progden_jax.cli.denoise")._Bars.follow = follow
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_an_interrupted_exact_divergence_is_resumed(tmp_path, frames, progden, monkeypatch):
     """By the same command, to the same bits; nothing of it is left then."""
     path, out = tmp_path / "room.exr", tmp_path / "clean.exr"
     write_exr(path, jax.tree.map(lambda a: a[:6, :7] if np.ndim(a) else a, frames[8]))
     call = ["denoise", path, "-o", out, "--method", "exact", "--no-aux", *QUICK]
     call += ["--save", "divergence,sure"]
-    bars, steps = importlib.import_module("progden_jax.cli.denoise")._Bars, []
-
-    def follow(bars, done, total):
-        steps.append(round(100 * done / total))
-        if len(steps) == 5:
-            os.kill(os.getpid(), signal.SIGINT)
-
-    monkeypatch.setattr(bars, "follow", follow)
-    status, _, stderr = progden(*call)
-    assert status == 130
+    program = [sys.executable, "-c", INTERRUPT_ITSELF, *map(str, call)]
+    broken = subprocess.run(program, capture_output=True, text=True, timeout=300, check=False)
+    assert broken.returncode == 130, broken.stderr
     (kept,) = (Path(os.environ["PROGDEN_CACHE"]) / "exact").iterdir()
-    told = re.search(r"(\d+)% of the exact divergence are kept in", stderr)
+    told = re.search(r"(\d+)% of the exact divergence are kept in", broken.stderr)
     assert told is not None
-    assert f"{path}: {told[0]} {kept}" in stderr
+    assert f"{path}: {told[0]} {kept}" in broken.stderr
     assert not out.exists()
 
-    interrupted = len(steps)
+    starts = []
+    bars = importlib.import_module("progden_jax.cli.denoise")._Bars
+    monkeypatch.setattr(
+        bars, "follow", lambda bars, done, total: starts.append(round(100 * done / total))
+    )
     assert progden(*call)[::2] == (0, "")
-    assert steps[interrupted] == int(told[1])
+    assert starts[0] == int(told[1])
     assert not kept.exists()
     resumed, _ = read_channels(out)
     assert progden(*call, "--force")[::2] == (0, "")
@@ -998,9 +1006,6 @@ def test_an_interrupted_exact_divergence_is_resumed(
         np.testing.assert_array_equal(resumed[name], values)
 
 
-# As a program of its own.
-
-
 def shell(command: str, *, cwd: Path, **settings) -> subprocess.CompletedProcess:
     return subprocess.run(
         ["bash", "-c", command], cwd=cwd, capture_output=True, text=True, timeout=120, **settings
@@ -1008,7 +1013,7 @@ def shell(command: str, *, cwd: Path, **settings) -> subprocess.CompletedProcess
 
 
 def test_the_program_denoises_and_exits_with_its_status(tmp_path, noisy, own):
-    ascii_only = os.environ | {"PYTHONIOENCODING": "ascii"}
+    ascii_only = users_environment() | {"PYTHONIOENCODING": "ascii"}
     program = f"{sys.executable} -m progden_jax denoise room.exr --denoiser {own[1]}"
     done = shell(f"{program} -o o.exr", cwd=tmp_path, env=ascii_only)
     assert (done.returncode, done.stderr) == (0, "")

@@ -1,6 +1,5 @@
 """`progden sweep`: an ablation over any settings, on several processes or machines."""
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -117,4 +116,6 @@ def sweep(
 def _usual() -> int:
     import jax
 
-    return min(len(os.sched_getaffinity(0)), 4) if jax.default_backend() == "cpu" else 1
+    from progden_jax._devices import cores
+
+    return min(len(cores()), 4) if jax.default_backend() == "cpu" else 1

@@ -190,7 +190,7 @@ def multiply_adds(nodes: Sequence[Node], params: Any, *, plain: bool = False) ->
         kernel, first = params[node.layer]["kernel"], node.sources[0]
         products = kernel.size
         if not plain and isinstance(nodes[first], Upsample) and folds(params[node.layer], None):
-            products -= 5 * widths[first] * kernel.shape[3]
+            products -= (9 - 4) * widths[first] * kernel.shape[3]
         total += products / 4**level
     return total
 

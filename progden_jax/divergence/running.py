@@ -16,7 +16,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from progden_jax import _checkpoint
+from progden_jax import _checkpoint, _devices
 from progden_jax._fingerprint import fingerprint
 from progden_jax.denoisers import graph
 from progden_jax.divergence import _reach, cone, exact, windows
@@ -250,7 +250,7 @@ class _ByColors:
 
 def _steps_at_once() -> int:
     """The small products of a step keep but one core busy."""
-    return len(os.sched_getaffinity(0)) if jax.default_backend() == "cpu" else 1
+    return len(_devices.cores()) if jax.default_backend() == "cpu" else 1
 
 
 def _closed(run: Callable[..., Any], f: Any) -> Callable[..., Any]:

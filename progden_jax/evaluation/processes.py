@@ -12,7 +12,7 @@ from typing import cast
 
 import jax
 
-from progden_jax import enable_compilation_cache
+from progden_jax import _devices, enable_compilation_cache
 from progden_jax.evaluation.dispatch import Lost, Outcome, attempt
 from progden_jax.evaluation.measure import Job
 
@@ -27,7 +27,7 @@ class Processes:
 
     def __init__(self, count: int) -> None:
         self.count = count
-        cores = sorted(os.sched_getaffinity(0))
+        cores = _devices.cores()
         self._cores = [cores[i::count] or cores for i in range(count)]
         # Forked children would have this process's XLA threads, locked as they were.
         self._context = multiprocessing.get_context("spawn")

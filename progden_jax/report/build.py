@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
-from progden_jax import _files, metrics, sheet
+from progden_jax import _devices, _files, metrics, sheet
 from progden_jax.evaluation.database import Row, rows
 from progden_jax.exr import read_exr_with_info, read_layers
 from progden_jax.frame import centre
@@ -148,7 +148,7 @@ class _Gathered:
         for row in chosen:
             groups.setdefault((row.scene, row.reference, row.crop), []).append(row)
         self._progress(0, self._total)
-        pool = ThreadPoolExecutor(len(os.sched_getaffinity(0)))
+        pool = ThreadPoolExecutor(len(_devices.cores()))
         try:
             list(pool.map(self._add_group, groups.values()))
         finally:
