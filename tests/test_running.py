@@ -131,16 +131,24 @@ def test_resumed_is_uninterrupted_bit_for_bit(method, x, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["part.npz"]
 
 
-def test_chunks_change_no_bits(x, monkeypatch):
-    step = jax.jit(
-        running._colors_step.__wrapped__,
-        static_argnames=("chunk", "dtype"),
+@pytest.mark.parametrize(
+    ("algorithm", "chunks", "step", "static"),
+    [
+        ("coloring", (5, 1, 16), "_colors_step", ("chunk", "dtype")),
+        ("cone", (5, 8, 16), "_cone_step", ("nodes", "size", "number", "chunk")),
+    ],
+)
+def test_chunks_change_no_bits(algorithm, chunks, step, static, x, monkeypatch):
+    """Of cones from 5 windows at a time on, see `Exact`."""
+    compiled = jax.jit(
+        getattr(running, step).__wrapped__,
+        static_argnames=static,
         compiler_options=as_for_users(),
     )
-    monkeypatch.setattr(running, "_colors_step", step)
+    monkeypatch.setattr(running, step, compiled)
     found = [
-        pd.exact_divergence(NETWORK, x, x, method=pd.Exact("coloring", chunk=chunk)).divergence
-        for chunk in (5, 1, 16)
+        pd.exact_divergence(NETWORK, x, x, method=pd.Exact(algorithm, chunk=chunk)).divergence
+        for chunk in chunks
     ]
     np.testing.assert_array_equal(found[1], found[0])
     np.testing.assert_array_equal(found[2], found[0])

@@ -152,7 +152,9 @@ class Sweep:
         if np.count_nonzero(matrices.any(0)) * others < WORTH_SLICES:
             alike = (matrices == matrices[0]).all()
             matrix = jnp.asarray(matrices[0]) if alike else jnp.asarray(matrices)[phase]
-            return jnp.tensordot(matrix, x, axes=(1, along), precision=self.precision)
+            # The matrix on the right: on the left Eigen sums differently with the number of windows.
+            rows = jnp.tensordot(x, matrix, axes=(along, 1), precision=self.precision)
+            return jnp.moveaxis(rows, -1, 0)
         slices = [lax.index_in_dim(x, i, along, keepdims=False) for i in range(x.shape[along])]
         rows = []
         for row in np.moveaxis(matrices, 0, -1):
