@@ -36,7 +36,7 @@ def main() -> None:
     )
     parser.add_argument("--size", type=int, default=256, help="edge in pixels, a multiple of 16")
     parser.add_argument("--denoiser", default="oidn-hdr")
-    parser.add_argument("--chunk", type=int, default=32)
+    parser.add_argument("--chunk", type=int, default=16)
     arguments = parser.parse_args()
     print(_common.machine())
     size = (arguments.size, arguments.size)
@@ -71,7 +71,8 @@ def main() -> None:
     counted = program.lower(params, kept, jnp.int32(0), chunk=cells)
     flops: Any = counted.cost_analysis()
     forward_flops: Any = forward.cost_analysis()
-    operations = flops["flops"] * plan.period**2 / forward_flops["flops"]
+    operations = flops["flops"] * plan.period**2
+    written = 2 * graph.multiply_adds(nodes, params, plain=True) * arguments.size**2
 
     once = least_seconds(lambda: forward(f, color), 7)
     per_phase = [
@@ -79,13 +80,21 @@ def main() -> None:
         for i in np.linspace(0, plan.period**2 - 1, PHASES).astype(int)
     ]
     whole = float(np.median(per_phase)) * plan.period**2
+    method = pd.Exact("cone", chunk=arguments.chunk)
+    pd.exact_divergence(f, color, color, method=method)
+    stepwise = least_seconds(
+        lambda: pd.exact_divergence(f, color, color, method=method).divergence, 1
+    )
     memory: Any = tangents.memory_analysis()
     rows = [
-        ("products by plan, forward passes", pd.Exact().cost(f, color)["cone"]),
-        ("operations by XLA's cost analysis, forward passes", operations),
+        ("multiply-adds by plan, forward passes", pd.Exact().cost(f, color)["cone"]),
+        ("operations by XLA, forward passes as they run", operations / forward_flops["flops"]),
+        ("operations by XLA, of the network as it is written", operations / written),
         ("one forward pass, ms", 1e3 * once),
-        ("whole, s (from 8 phases)", whole),
-        ("whole, forward passes", whole / once),
+        ("in one program, s (from 8 phases)", whole),
+        ("in one program, forward passes", whole / once),
+        ("exact_divergence, s", stepwise),
+        ("exact_divergence, forward passes", stepwise / once),
         ("compile, s", compile_time),
         ("XLA temporaries, MB", memory.temp_size_in_bytes / 1e6),
     ]

@@ -13,7 +13,7 @@ from progden_jax.denoisers import graph as g
 from progden_jax.divergence._short import Axis
 from progden_jax.divergence.windows import Plan, Window, convolutions
 
-WORTH_SLICES = 5e8
+WORTH_SLICES = 2e8
 """Multiply-adds with one small matrix in all from which on sums of slices, three times as quick as XLA's
 products with such matrices, gain more than the quarter of a second that their compilation takes."""
 
