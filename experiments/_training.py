@@ -1,11 +1,13 @@
 """What the experiments that train mixers share."""
 
 import argparse
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from experiments import _common
+from progden_jax._devices import cores_as_devices
 from progden_jax.training import MixerConfig, MixerTask, config, train
 from progden_jax.training.evaluation import Scores
 
@@ -41,6 +43,7 @@ def configuration(base: str, fields: Mapping[str, Any]) -> MixerConfig:
 
 def train_all(runs: Mapping[str, MixerConfig], output: Path) -> None:
     """Each run in a folder of its own; goes on where it was killed, and leaves alone what is done."""
+    cores_as_devices(math.gcd(*(chosen.batch for chosen in runs.values())))
     for name, chosen in runs.items():
         train(MixerTask(chosen), output / name, report=_Lines(name))
 

@@ -1,5 +1,6 @@
 """One program over several devices: a stack of windows or frames, one for each."""
 
+import contextlib
 import functools
 import itertools
 import os
@@ -22,6 +23,24 @@ _SPLIT = PartitionSpec(_AXIS)
 def cores() -> list[int]:
     """The CPU's that this process may use."""
     return sorted(os.sched_getaffinity(0))
+
+
+def cores_as_devices(batch: int) -> None:
+    """Let JAX, where it has not begun yet, see CPU cores as devices: as many as share a batch evenly.
+
+    Of a training step XLA runs much on one core only. Shared between devices, all cores have something to do.
+    Settings of the user's stay, and so does a JAX that has begun.
+    """
+    count = max(n for n in range(1, min(len(cores()), _MOST) + 1) if batch % n == 0)
+    said = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
+    if said or getattr(jax.config, "jax_num_cpu_devices", -1) != -1:
+        return
+    with contextlib.suppress(RuntimeError):  # what JAX raises once it has begun
+        jax.config.update("jax_num_cpu_devices", count)
+
+
+_MOST = 8
+"""Cores to make devices of: each keeps a copy of all examples."""
 
 
 def on_each(

@@ -281,11 +281,14 @@ def assert_near(found, expected):
     )
 
 
-@pytest.mark.parametrize("channels", [3, 40])
-def test_convolution_and_its_derivatives(channels):
+@pytest.mark.parametrize("channels", [(3, 2), (2, 5), (43, 20)])
+def test_convolution_and_its_derivatives(channels, monkeypatch):
+    """In each form that the derivative by the kernel has, of more than one strip."""
+    monkeypatch.setattr("progden_jax._convolution._STRIP", 16)
+    inputs, outputs = channels
     rng = np.random.default_rng(0)
-    x = jnp.asarray(rng.normal(size=(2, 2, 6, 7, channels)), jnp.float32)
-    kernel = jnp.asarray(rng.normal(size=(3, 5, channels, 2)) / channels, jnp.float32)
+    x = jnp.asarray(rng.normal(size=(2, 2, 6, 7, inputs)), jnp.float32)
+    kernel = jnp.asarray(rng.normal(size=(3, 5, inputs, outputs)) / inputs, jnp.float32)
     expected = derivatives(plain_convolution, x, kernel)
     assert_near(derivatives(same_convolution, x, kernel), expected)
 

@@ -14,6 +14,8 @@ from conftest import counting_compilations
 import progden_jax as pd
 from progden_jax import mixers
 from progden_jax.cli import main
+from progden_jax.denoisers import KPCN, UNet
+from progden_jax.denoisers.graph import Conv
 from progden_jax.training import (
     DenoiserConfig,
     DenoiserTask,
@@ -637,6 +639,68 @@ def test_training_a_denoiser(folder, tmp_path):
     last = lines[-2]
     assert lines[-1]["denoised/rmse/4spp"] < lines[-1]["render/rmse/4spp"]
     assert np.isfinite(last["train/loss"])
+
+
+def _example(seed=0):
+    rng = np.random.default_rng(seed)
+    color, albedo, variance = rng.random((3, 16, 16, 3), np.float32)
+    return pd.Frame(color, 0.1 * variance, albedo=albedo, normal=2 * albedo - 1)
+
+
+@pytest.mark.parametrize(
+    ("kind", "options"), [(UNet, {"size": "small"}), (KPCN, {"layers": 1, "width": 4})]
+)
+def test_further_inputs(kind, options):
+    """A network that is given more buffers gives the same images, and learns to use them."""
+    narrow = kind.init(jax.random.key(0), ("albedo",), **options)
+    wide = narrow.with_inputs(("normal", "albedo", "variance"))
+    frame = _example()
+    np.testing.assert_allclose(wide(frame), narrow(frame), rtol=1e-5, atol=1e-5)
+    found = jax.grad(lambda network: jnp.square(network(frame)).mean())(wide)
+    first = next(node.layer for node in wide.nodes if isinstance(node, Conv))
+    by_buffer = np.abs(found.params[first]["kernel"]).max((0, 1, 3))
+    assert (by_buffer > 0).all()
+    with pytest.raises(ValueError, match="takes albedo, and inputs is .'variance',."):
+        narrow.with_inputs(("variance",))
+
+
+def test_weights_to_start_from(folder, tmp_path):
+    """Training goes on from a file's weights, of a denoiser with fewer inputs too."""
+    changes = {"data": [str(folder)], "crop": 16, "start": str(tmp_path / "net.safetensors")}
+    options = dict(config.load(DenoiserConfig, "smoke").options)
+    given = KPCN.init(jax.random.key(3), (), **options)
+    pd.denoisers.save(changes["start"], given, dtype="float32")
+    chosen = config.load(DenoiserConfig, "smoke", {**changes, "inputs": ["variance"]})
+    begun = DenoiserTask(chosen).init(jax.random.key(0))
+    assert begun.inputs == ("variance",)
+    frame = _example()
+    np.testing.assert_allclose(begun(frame), given(frame), rtol=1e-5, atol=1e-7)
+    for more, message in (
+        (
+            {"options": {**options, "width": 9}},
+            "has 4 weights conv1.bias; this configuration makes 9",
+        ),
+        (
+            {"architecture": "unet", "options": {"size": "small"}},
+            "a KPCN; what is trained is a UNet",
+        ),
+        ({"start": "oidn"}, "is 'oidn', expected one of oidn-hdr"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            DenoiserTask(config.load(DenoiserConfig, "smoke", {**changes, **more}))
+
+
+def test_a_mixer_to_start_from(folder, trainer, tmp_path):
+    architecture = trainer.task.architecture
+    params = architecture.init(jax.random.key(5))
+    path = tmp_path / "mixer.safetensors"
+    mixers.save_mixer(path, mixers.NetworkMixer(params, architecture))
+    make = functools.partial(MixerTask, denoiser=Blur(), cache_folder=tmp_path)
+    task = make(_config(folder, options={"width": 4}, start=str(path)))
+    jax.tree.map(np.testing.assert_array_equal, task.init(jax.random.key(0)), params)
+    for start, options in ((str(path), {"width": 6}), ("closed-form", {"width": 4})):
+        with pytest.raises(ValueError, match="start is .*; what is trained is "):
+            make(_config(folder, options=options, start=start))
 
 
 def test_denoiser_configurations(folder):

@@ -15,10 +15,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import progden_jax as pd
 from experiments import _common
 from progden_jax import mixers
+from progden_jax._devices import cores_as_devices
 from progden_jax.training import MixerConfig, MixerTask, config
 from progden_jax.training.step import make_start, make_step
 
@@ -83,6 +85,7 @@ def main() -> None:
     parser.add_argument("--channels", type=int, default=96, help="of the convolution compared with")
     arguments = parser.parse_args()
     pd.enable_compilation_cache()
+    cores_as_devices(arguments.batch)  # as `progden train` does
     print(_common.machine(), flush=True)
     large, images, count = convolution(1, 512, arguments.channels)
     rows = []
@@ -96,8 +99,10 @@ def main() -> None:
                 batch=arguments.batch,
                 crop=arguments.crop,
             )
-            state, step = make_start(task)(jax.random.key(0)), make_step(task, None)
-            arrays = jax.device_put(dict(task.arrays))
+            mesh = Mesh(np.asarray(jax.devices()), ("batch",)) if len(jax.devices()) > 1 else None
+            everywhere = NamedSharding(mesh, PartitionSpec()) if mesh else None
+            state, step = make_start(task)(jax.random.key(0)), make_step(task, mesh)
+            state, arrays = jax.device_put((state, dict(task.arrays)), everywhere)
             chosen = jnp.arange(task.config.batch) % len(task.items)
 
             def once(state: Any = state, step: Any = step, a: Any = arrays, c: Any = chosen) -> Any:

@@ -81,7 +81,7 @@ def mixer(
 
     chosen = _load(MixerConfig, config, data, set)
     task = functools.partial(MixerTask, chosen, cache_folder=cache)
-    return _train(task, output, until=until, json=json)
+    return _train(task, output, share=chosen.batch, until=until, json=json)
 
 
 _ = app.command(mixer, help=_MIXER_HELP, usage="Usage: progden train mixer -o OUTPUT [OPTIONS]")
@@ -99,8 +99,10 @@ def denoiser(
     from progden_jax.training import DenoiserConfig, DenoiserTask
 
     chosen = _load(DenoiserConfig, config, data, set)
+    # Batch normalisation would take a core's part of the batch for all of it.
+    share = 1 if chosen.architecture == "residual" else chosen.batch
     task = functools.partial(DenoiserTask, chosen)
-    return _train(task, output, until=until, json=json)
+    return _train(task, output, share=share, until=until, json=json)
 
 
 _ = app.command(
@@ -122,7 +124,7 @@ def combiner(
 
     chosen = _load(CombinerConfig, config, data, set)
     task = functools.partial(CombinerTask, chosen, cache_folder=cache)
-    return _train(task, output, until=until, json=json)
+    return _train(task, output, share=chosen.batch, until=until, json=json)
 
 
 _ = app.command(
@@ -151,15 +153,18 @@ def _train(
     make: "Callable[..., Task]",
     output: Path,
     *,
+    share: int,
     until: int | None,
     json: bool,
 ) -> int:
     from progden_jax import enable_compilation_cache
+    from progden_jax._devices import cores_as_devices
     from progden_jax.training import train
 
     if until is not None and until < 1:
         raise UsageError(f"--until is {until}, expected a step from 1 up.")
     enable_compilation_cache()
+    cores_as_devices(share)
     with counting("renders, denoised") as progress:
         task = make(progress=progress)
     with contextlib.closing(_Report(quiet=json)) as report:

@@ -15,10 +15,11 @@ from typing import Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from progden_jax import _checks, transfer
-from progden_jax.denoisers import unet
+from progden_jax.denoisers import graph, unet
 from progden_jax.denoisers._network import (
     Network,
     Params,
@@ -75,6 +76,42 @@ class LogNetwork(Network):
             return normal_to_unit(buffer)
         return (transfer.arctan if role == "variance" else transfer.log1p_normalized)(lit(buffer))
 
+    def with_inputs(self, inputs: tuple[str, ...]) -> Self:
+        """The network that takes these buffers too, with weights of zero: it gives the same images.
+
+        Training goes on from there: zero weights of a first layer do learn.
+
+        Raises
+        ------
+        ValueError
+            If a buffer is none that the network knows, or one that it takes already is missing.
+        """
+        for role in inputs:
+            _checks.choice("inputs", role, self.buffers)
+        if missing := [role for role in self.inputs if role not in inputs]:
+            raise ValueError(
+                f"{self.name} takes {' and '.join(missing)}, and inputs is {inputs}: add what it takes."
+            )
+        taken = _channels_by_role(self.inputs)
+        rows = [
+            taken[role] if role in taken else np.full(channels_of(role), -1)
+            for role in ("color", *inputs)
+        ]
+        widths = graph.channels(self.nodes, self.params)
+        params = dict(self.params)
+        for node in self.nodes:
+            if isinstance(node, Conv) and 0 in node.sources:
+                kernel = params[node.layer]["kernel"]
+                ends = np.cumsum([widths[source] for source in node.sources])[:-1]
+                parts = jnp.split(kernel, ends, axis=2)
+                parts = [
+                    _picked(part, np.concatenate(rows)) if source == 0 else part
+                    for source, part in zip(node.sources, parts, strict=True)
+                ]
+                wide = jnp.concatenate(parts, axis=2)
+                params[node.layer] = {**params[node.layer], "kernel": wide}
+        return type(self)(params, inputs, name=self.name, precision=self.precision)
+
     @classmethod
     def he_params(
         cls,
@@ -87,6 +124,18 @@ class LogNetwork(Network):
         roles = ("color", *inputs)
         gains = [cls.gains.get(role, 1.0) for role in roles for _ in range(channels_of(role))]
         return he_params(key, nodes, shapes, gains)
+
+
+def _channels_by_role(inputs: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Which of the network's input channels each buffer is."""
+    roles = ("color", *inputs)
+    ends = np.cumsum([channels_of(role) for role in roles])
+    return {r: np.arange(end - channels_of(r), end) for r, end in zip(roles, ends, strict=True)}
+
+
+def _picked(kernel: Array, rows: np.ndarray) -> Array:
+    """The kernel's input channels by number, zeros where that is -1."""
+    return jnp.where((rows >= 0)[:, None], kernel[:, :, rows], 0)
 
 
 def quietened(params: dict[str, Any], layer: str, bias: float) -> dict[str, Any]:

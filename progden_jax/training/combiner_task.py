@@ -10,12 +10,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from progden_jax import combiner, denoisers, metrics
+from progden_jax.combiner import files
 from progden_jax.combiner.network import Params
 from progden_jax.denoisers import Denoiser
 from progden_jax.training import augment, data, evaluation, losses
 from progden_jax.training.config import CombinerConfig
 from progden_jax.training.estimates import EstimateCache
 from progden_jax.training.mixer_task import check_exposure
+from progden_jax.training.start import match
 
 _METRICS = ("rmse", "smape", "relmse")
 
@@ -58,6 +60,9 @@ class CombinerTask:
             raise ValueError(f"options is {dict(config.options)}: {error}") from None
         self.denoiser = denoisers.load(config.denoiser) if denoiser is None else denoiser
         check_exposure(config, self.denoiser)
+        jax.eval_shape(
+            self.init, jax.random.key(0)
+        )  # says what is wrong with the start, if anything
         self.cache = EstimateCache(self.denoiser, None, cache_folder)
         auxiliary = [role for role in self.network.inputs if role != "variance"]
         examples, held = data.load_split(
@@ -73,7 +78,16 @@ class CombinerTask:
         self._held = {name: jnp.asarray(array) for name, array in held.arrays.items()}
 
     def init(self, key: jax.Array) -> Params:
-        return self.network.init(key)
+        params, start = self.network.init(key), self.config.start
+        if not start:
+            return params
+        found = files.read(start)
+        if found.network != self.network:
+            raise ValueError(
+                f"start is {start!r}, {found.network}; what is trained is {self.network}."
+            )
+        match(start, found.params, params)
+        return found.params
 
     def example(
         self, arrays: Mapping[str, Array], index: Array, key: jax.Array

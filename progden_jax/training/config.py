@@ -48,6 +48,7 @@ class RunConfig:
     clip_norm: float = 1.0  # of the whole gradient; 0: not clipped
     ema: float = 0.0  # decay of the averaged weights that are evaluated and saved; 0: the last ones
     precision: str = "default"  # of products: default (TF32 on GPUs), high or highest (float32)
+    start: str = ""  # weights to train on from, a shipped name or a file; none: random ones
     seed: int = 0  # of weights, order and augmentation
     log_every: int = 50  # steps between points of the training curves
     evaluate_every: int = 500  # steps between evaluations on the held-out scenes

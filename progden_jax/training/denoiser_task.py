@@ -3,22 +3,24 @@
 import functools
 import os
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from progden_jax import _checks
+from progden_jax import _checks, denoisers
 from progden_jax.denoisers import Network, files
 from progden_jax.denoisers.graph import Moments
+from progden_jax.denoisers.own import LogNetwork
 from progden_jax.divergence import MonteCarlo
 from progden_jax.frame import Frame
 from progden_jax.sure import sure
 from progden_jax.training import augment, data, evaluation, losses, order
 from progden_jax.training.config import DenoiserConfig
 from progden_jax.training.normalization import BATCH, BatchNormalized, pooled
+from progden_jax.training.start import match
 
 _BUFFERS = ("albedo", "normal", "depth")
 
@@ -72,6 +74,8 @@ class DenoiserTask:
     def init(self, key: jax.Array) -> Any:
         kind: Any = files.ARCHITECTURES[self.config.architecture]
         network = kind.init(key, self.config.inputs, precision="default", **self.config.options)
+        if self.config.start:
+            return _begun(self.config.start, network)
         return BatchNormalized.of(network) if network.normalized else network
 
     def example(
@@ -129,6 +133,24 @@ class DenoiserTask:
         examples = jax.jit(jax.vmap(self.example, (None, 0, 0)))
         found = examples(arrays, jnp.arange(len(chosen)), keys)
         return jax.tree.map(lambda a: a.reshape(_BATCHES, config.batch, *a.shape[1:]), found)
+
+
+def _begun(start: str, network: Network) -> Network:
+    """The network with the weights of that name, which may take fewer inputs."""
+    found = denoisers.load(start, precision=network.precision)
+    if type(found) is not type(network) or network.normalized:
+        wanted = f"a {type(network).__name__}"
+        if network.normalized:
+            wanted += ", which cannot go on from a file: its batch normalisation is folded in there"
+        raise ValueError(
+            f"start is {start!r}, a {type(found).__name__}; what is trained is {wanted}."
+        )
+    try:
+        wide = cast(LogNetwork, found).with_inputs(network.inputs)
+    except ValueError as error:
+        raise ValueError(f"start is {start!r}: {error}") from None
+    match(start, wide.params, network.params)
+    return wide
 
 
 def _frame(example: Mapping[str, Array]) -> Frame:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from progden_jax import denoisers
+from progden_jax import denoisers, mixers
 from progden_jax.denoisers import OIDN, Denoiser
 from progden_jax.divergence import (
     Exact,
@@ -24,6 +24,7 @@ from progden_jax.sure import sure
 from progden_jax.training import augment, data, evaluation, losses
 from progden_jax.training.config import CombinerConfig, MixerConfig
 from progden_jax.training.estimates import EstimateCache
+from progden_jax.training.start import match
 from progden_jax.tstatistic import t_bound
 
 _WITHOUT_PROBES: dict[str, Method] = {
@@ -75,6 +76,9 @@ class MixerTask:
         if denoiser is None:
             denoiser = denoisers.load(config.denoiser)
         check_exposure(config, denoiser)
+        jax.eval_shape(
+            self.init, jax.random.key(0)
+        )  # says what is wrong with the start, if anything
         tangents = config.loss == "sure" and config.sure_derivative == "probe"
         method = build_method(config)
         self.cache = EstimateCache(denoiser, method, cache_folder, tangents=tangents)
@@ -86,7 +90,16 @@ class MixerTask:
         self.held_out = evaluation.HeldOut(*held)
 
     def init(self, key: jax.Array) -> Params:
-        return self.architecture.init(key)
+        params, start = self.architecture.init(key), self.config.start
+        if not start:
+            return params
+        found = mixers.load(start)
+        if not isinstance(found, NetworkMixer) or found.architecture != self.architecture:
+            raise ValueError(
+                f"start is {start!r}, {found!r}; what is trained is {self.architecture!r}."
+            )
+        match(start, found.params, params)
+        return found.params
 
     def example(
         self, arrays: Mapping[str, Array], index: Array, key: jax.Array
