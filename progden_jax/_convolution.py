@@ -10,7 +10,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 _LAYOUT = ("NHWC", "HWIO", "NHWC")
-_STRIP = 512
+_STRIP = 256
 """Pixels whose columns are made at once: few enough for them to stay in a core's cache."""
 
 
@@ -181,8 +181,12 @@ def _by_products(inputs: Array, kernel: Array, precision: Any) -> Array:
         for d in range(1, inputs.shape[1] + 1)
         if inputs.shape[1] % d == 0 and (d == 1 or d * width <= _STRIP)
     )
+    if (kh, kw) == (1, 1):
+        return jnp.matmul(inputs, kernel[0, 0], precision=precision)
     if kh * ci >= _WIDE and kw * co >= 3 * _WIDE // 4:
         return _by_rows_and_columns(inputs, kernel, height, precision)
+    if kw == 3 and width % 2 == 0 and 2 * kh * ci >= _WIDE and 4 * co >= _WIDE:
+        return _by_cells(inputs, kernel, height, precision)
     by_taps = _by_output_taps if co < ci else _by_input_taps
     return by_taps(inputs, kernel, height, precision)
 
@@ -218,6 +222,34 @@ def _by_rows_and_columns(inputs: Array, kernel: Array, height: int, precision: A
         columns = lax.split(products.reshape(height, w, -1), (co,) * kw, axis=2)
         moved = (_moved(c, 0, kw // 2 - j) for j, c in enumerate(columns))
         return functools.reduce(jnp.add, moved)
+
+    return _by_strips(one, matrix, n, h // height).reshape(n, h, w, co)
+
+
+def _by_cells(inputs: Array, kernel: Array, height: int, precision: Any) -> Array:
+    """As `_by_rows_and_columns` where channels are too few for it, on cells of two pixels of a row.
+
+    A cell meets itself, the first pixel of the next cell and the last of the one before; a quarter of the
+    products are zeros.
+    """
+    (kh, _, ci, co), (n, h, w, _) = kernel.shape, inputs.shape
+    cells = inputs.reshape(n, h, w // 2, 2 * ci)
+    padded = jnp.pad(cells, ((0, 0), (kh // 2,) * 2, (0, 0), (0, 0)))
+    zero = jnp.zeros((kh, ci, co), kernel.dtype)
+    left, middle, right = (kernel[:, j] for j in range(3))
+    # From each pixel of the cell: to its two, to the next one's first, to the last one's second.
+    first = jnp.concatenate([middle, left, zero, right], axis=-1)
+    second = jnp.concatenate([right, middle, left, zero], axis=-1)
+    matrix = jnp.stack([first, second], axis=1).reshape(2 * kh * ci, 4 * co)
+
+    def one(image: Array, strip: Array, matrix: Array) -> Array:
+        rows = _rows_of(padded, image, strip * height, height + kh - 1)
+        tall = jnp.concatenate([rows[i : i + height] for i in range(kh)], axis=-1)
+        products = jnp.matmul(tall.reshape(height * w // 2, -1), matrix, precision=precision)
+        own, after, before = lax.split(
+            products.reshape(height, w // 2, -1), (2 * co, co, co), axis=2
+        )
+        return own + jnp.concatenate([_moved(after, 0, 1), _moved(before, 0, -1)], axis=-1)
 
     return _by_strips(one, matrix, n, h // height).reshape(n, h, w, co)
 

@@ -281,14 +281,17 @@ def assert_near(found, expected):
     )
 
 
-@pytest.mark.parametrize("channels", [(3, 2), (2, 5), (43, 20)])
-def test_convolution_and_its_derivatives(channels, monkeypatch):
+@pytest.mark.parametrize(
+    "shape",
+    [(1, 1, 3, 2), (3, 5, 3, 2), (3, 5, 2, 5), (5, 3, 13, 32), (5, 3, 26, 32)],
+    ids=["1x1", "output taps", "input taps", "cells", "rows and columns"],
+)
+def test_convolution_and_its_derivatives(shape, monkeypatch):
     """In each form that the derivative by the kernel has, of more than one strip."""
     monkeypatch.setattr("progden_jax._convolution._STRIP", 16)
-    inputs, outputs = channels
     rng = np.random.default_rng(0)
-    x = jnp.asarray(rng.normal(size=(2, 2, 6, 7, inputs)), jnp.float32)
-    kernel = jnp.asarray(rng.normal(size=(3, 5, inputs, outputs)) / inputs, jnp.float32)
+    x = jnp.asarray(rng.normal(size=(2, 2, 6, 8, shape[2])), jnp.float32)
+    kernel = jnp.asarray(rng.normal(size=shape) / shape[2], jnp.float32)
     expected = derivatives(plain_convolution, x, kernel)
     assert_near(derivatives(same_convolution, x, kernel), expected)
 

@@ -704,7 +704,7 @@ def test_a_mixer_to_start_from(folder, trainer, tmp_path):
 
 
 def test_denoiser_configurations(folder):
-    named = {"cpu", "gpu", "kpcn", "paper", "residual", "residual-small", "small", "smoke"}
+    named = {"cpu", "gpu", "kpcn", "paper", "residual", "residual-small", "small", "smoke", "wider"}
     assert set(config.names(DenoiserConfig)) == named
     for name in config.names(DenoiserConfig):
         config.load(DenoiserConfig, name)
