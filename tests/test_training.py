@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import json
+import shutil
 from pathlib import Path
 
 import jax
@@ -169,6 +170,16 @@ def test_a_folder_belongs_to_one_run(whole, folder, tmp_path):
     )
     with pytest.raises(ValueError, match=r"other settings \(peak_rate is 0\.1 and was 0\.001\)"):
         train(other, where)
+
+
+def test_a_run_of_an_earlier_version_goes_on(whole, trainer, tmp_path):
+    """Fields that its version did not know are as if they had their defaults."""
+    _, where, _ = whole
+    there = shutil.copytree(where, tmp_path / "run")
+    written = json.loads((there / "run.json").read_text())
+    written["config"].pop("start")
+    (there / "run.json").write_text(json.dumps(written))
+    assert int(trainer.run(there).state.step) == 6
 
 
 def test_weights_are_the_best_and_say_where_they_come_from(trainer, whole):

@@ -1,5 +1,6 @@
 """Checkpoints that are whole or not there, and what they belong to."""
 
+import dataclasses
 import hashlib
 import json
 from pathlib import Path
@@ -75,8 +76,10 @@ def describe(kind: str, config: RunConfig, items: Any) -> dict[str, Any]:
     return {"kind": kind, "config": fields, "renders": digest}
 
 
-def claim(folder: Path, description: dict[str, Any]) -> None:
+def claim(folder: Path, description: dict[str, Any], defaults: dict[str, Any]) -> None:
     """Mark the folder as that of this run, or check that it is.
+
+    `defaults` are those of fields, for a run of a version that did not have them yet.
 
     Raises
     ------
@@ -93,7 +96,7 @@ def claim(folder: Path, description: dict[str, Any]) -> None:
     differing = [
         f"{name} is {new!r} and was {old!r}"
         for name, new in description["config"].items()
-        if name not in _FREE and new != (old := there.get("config", {}).get(name))
+        if name not in _FREE and new != (old := {**defaults, **there["config"]}.get(name))
     ]
     differing += [f"the {k} differ" for k in ("kind", "renders") if there.get(k) != description[k]]
     if differing:
@@ -105,10 +108,16 @@ def claim(folder: Path, description: dict[str, Any]) -> None:
 
 def plain(config: RunConfig) -> dict[str, Any]:
     """The configuration as plain JSON."""
+    return {name: _plain(value) for name, value in vars(config).items()}
 
-    def one(value: Any) -> Any:
-        if isinstance(value, tuple):
-            return list(value)
-        return dict(value) if hasattr(value, "items") else value
 
-    return {name: one(value) for name, value in vars(config).items()}
+def defaults_of(config: RunConfig) -> dict[str, Any]:
+    """What fields are where nothing is said, as plain JSON."""
+    fields = dataclasses.fields(config)
+    return {f.name: _plain(f.default) for f in fields if f.default is not dataclasses.MISSING}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return list(value)
+    return dict(value) if hasattr(value, "items") else value

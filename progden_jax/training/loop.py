@@ -16,7 +16,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import progden_jax
 from progden_jax.training import order
-from progden_jax.training.checkpoints import Checkpoints, claim, describe, plain
+from progden_jax.training.checkpoints import Checkpoints, claim, defaults_of, describe, plain
 from progden_jax.training.curves import Curves
 from progden_jax.training.evaluation import Scores
 from progden_jax.training.step import State, Task, keep_best, make_start, make_step, schedule
@@ -92,7 +92,7 @@ class Trainer:
     ) -> Outcome:
         """Train to the end of the schedule, or go on with what `folder` holds; see `train`."""
         task, config, folder = self.task, self.task.config, Path(folder)
-        claim(folder, describe(task.kind, config, task.items))
+        claim(folder, describe(task.kind, config, task.items), defaults_of(config))
         with closing(Checkpoints(folder)) as checkpoints:
             state = jax.device_put(self._start(self._key), self._everywhere)
             state = checkpoints.restore(state) or state
