@@ -5,6 +5,7 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import ClassVar
 
 import jax
@@ -14,6 +15,7 @@ import pytest
 from jax.sharding import Mesh
 
 import progden_jax as pd
+from progden_jax import _devices
 from progden_jax.training.config import RunConfig
 from progden_jax.training.step import make_start, make_step
 
@@ -148,3 +150,27 @@ def test_devices_are_checked():
     halved = pd.FunctionDenoiser(lambda x: 0.5 * x)
     with pytest.raises(ValueError, match="cannot work on tiles"):
         pd.progressive_denoise(frame, halved, **how, devices=jax.devices())
+
+
+@pytest.mark.parametrize(
+    ("cores", "batch", "flags", "expected"),
+    [
+        (4, 6, "", 3),
+        (2, 12, "", 2),
+        (64, 12, "", 6),
+        (1, 5, "", 1),
+        (2, 12, "--xla_force_host_platform_device_count=5", None),
+    ],
+)
+def test_cores_as_devices(monkeypatch, cores, batch, flags, expected):
+    """As many as share a batch, unless the user has said something; JAX that has begun stays as it is."""
+    asked = {}
+    monkeypatch.setattr(_devices, "cores", lambda: list(range(cores)))
+    monkeypatch.setenv("XLA_FLAGS", flags)
+    with monkeypatch.context() as patched:
+        patched.setattr(_devices.jax, "config", SimpleNamespace(update=asked.__setitem__))
+        _devices.cores_as_devices(batch)
+    assert asked.get("jax_num_cpu_devices") == expected
+    before = len(jax.devices())
+    _devices.cores_as_devices(batch)
+    assert len(jax.devices()) == before
