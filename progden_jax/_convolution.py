@@ -67,13 +67,18 @@ def _jvp(
 ) -> tuple[Array, Array]:
     (inputs, kernel), (by_inputs, by_kernel) = primals, tangents
     out = same_convolution(inputs, kernel, precision)
-    slope = jnp.zeros_like(out)
+    slopes = []
     if not isinstance(by_inputs, SymbolicZero):
-        slope = slope + same_convolution(by_inputs, kernel, precision)
+        slopes.append(same_convolution(by_inputs, kernel, precision))
     if not isinstance(by_kernel, SymbolicZero):
         along = _by_products if jax.default_backend() == "cpu" else _convolve
-        slope = slope + along(inputs, by_kernel, precision)
-    return out, slope
+        slopes.append(along(inputs, by_kernel, precision))
+    return out, _total(slopes, out)
+
+
+def _total(slopes: list[Array], out: Array) -> Array:
+    """Their sum. No zeros are added where there are some: a linearised network would keep them in memory."""
+    return functools.reduce(jnp.add, slopes) if slopes else jnp.zeros_like(out)
 
 
 _FEW = 4
@@ -116,20 +121,20 @@ def _upsampled_jvp(
 ) -> tuple[Array, Array]:
     (low, skip, kernel), (by_low, by_skip, by_kernel) = primals, tangents
     out = upsampled_convolution(low, skip, kernel, precision)
-    slope = jnp.zeros_like(out)
+    slopes = []
     channels = low.shape[-1]
     if not isinstance(by_low, SymbolicZero):
         if isinstance(by_skip, SymbolicZero):
             skip_slope, taken = skip[..., :0], kernel[:, :, :channels]
         else:
             skip_slope, taken = by_skip, kernel
-        slope = slope + upsampled_convolution(by_low, skip_slope, taken, precision)
+        slopes.append(upsampled_convolution(by_low, skip_slope, taken, precision))
     elif not isinstance(by_skip, SymbolicZero):
-        slope = slope + same_convolution(by_skip, kernel[:, :, channels:], precision)
+        slopes.append(same_convolution(by_skip, kernel[:, :, channels:], precision))
     if not isinstance(by_kernel, SymbolicZero):
         both = jnp.concatenate([_repeated(low), skip], axis=-1)
-        slope = slope + _by_products(both, by_kernel, precision)
-    return out, slope
+        slopes.append(_by_products(both, by_kernel, precision))
+    return out, _total(slopes, out)
 
 
 def _repeated(low: Array) -> Array:
