@@ -2,7 +2,6 @@
 
 import contextlib
 import ctypes
-import functools
 import math
 import os
 import re
@@ -143,16 +142,10 @@ def bytes_of(compiled: Any) -> int:
     return found.temp_size_in_bytes + found.argument_size_in_bytes + found.output_size_in_bytes
 
 
-@functools.cache
-def _tangents_kept(probes: int) -> float:
-    return 1.0 if probes == 1 else 1.5
-
-
 def guess(denoiser: Any, method: Any, mixer: Any = None) -> float:
     """Bytes per pixel that a window's program may take, from the widest layers at full resolution."""
-    probes = getattr(method, "probes", None) or 1
     chunk = getattr(method, "chunk", None) or 1
-    network = _widest(denoiser, 128) * (_tangents_kept(probes) + (chunk - 1))
+    network = _widest(denoiser, 128) * chunk
     return 4 * 2.3 * max(network, _widest(mixer, 0))
 
 
