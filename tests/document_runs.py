@@ -66,8 +66,8 @@ _TRAINING = r"\g<0> --set steps=2 --set batch=2 --set crop=16 --set held_out=0.5
 SMALLER = (
     Smaller(
         "progden train denoiser .*",
-        rf"{_TRAINING} --set architecture=kpcn --set 'options={{layers = 2, width = 4}}'",
-        "two steps of a network of two layers, on two crops",
+        rf"{_TRAINING} --set start= --set architecture=kpcn --set 'options={{layers = 2, width = 4}}'",
+        "two steps of a network of two layers from random weights, on two crops",
     ),
     Smaller(
         "progden train combiner .*",
