@@ -288,7 +288,7 @@ def assert_near(found, expected):
 )
 def test_convolution_and_its_derivatives(shape, monkeypatch):
     """In each form that the derivative by the kernel has, of more than one strip."""
-    monkeypatch.setattr("progden_jax._convolution._STRIP", 16)
+    monkeypatch.setattr("progden_jax._kernel_products._STRIP", 16)
     rng = np.random.default_rng(0)
     x = jnp.asarray(rng.normal(size=(2, 2, 6, 8, shape[2])), jnp.float32)
     kernel = jnp.asarray(rng.normal(size=shape) / shape[2], jnp.float32)

@@ -17,7 +17,6 @@ from progden_jax.training import augment, data, evaluation, losses
 from progden_jax.training.config import CombinerConfig
 from progden_jax.training.estimates import EstimateCache
 from progden_jax.training.mixer_task import check_exposure
-from progden_jax.training.start import match
 
 _METRICS = ("rmse", "smape", "relmse")
 
@@ -60,9 +59,7 @@ class CombinerTask:
             raise ValueError(f"options is {dict(config.options)}: {error}") from None
         self.denoiser = denoisers.load(config.denoiser) if denoiser is None else denoiser
         check_exposure(config, self.denoiser)
-        jax.eval_shape(
-            self.init, jax.random.key(0)
-        )  # says what is wrong with the start, if anything
+        self._start = _begun(config.start, self.network) if config.start else None
         self.cache = EstimateCache(self.denoiser, None, cache_folder)
         auxiliary = [role for role in self.network.inputs if role != "variance"]
         examples, held = data.load_split(
@@ -78,16 +75,7 @@ class CombinerTask:
         self._held = {name: jnp.asarray(array) for name, array in held.arrays.items()}
 
     def init(self, key: jax.Array) -> Params:
-        params, start = self.network.init(key), self.config.start
-        if not start:
-            return params
-        found = files.read(start)
-        if found.network != self.network:
-            raise ValueError(
-                f"start is {start!r}, {found.network}; what is trained is {self.network}."
-            )
-        match(start, found.params, params)
-        return found.params
+        return self.network.init(key) if self._start is None else self._start
 
     def example(
         self, arrays: Mapping[str, Array], index: Array, key: jax.Array
@@ -135,6 +123,14 @@ class CombinerTask:
         made = combiner.DeepCombiner(params, self.denoiser, self.network)
         said = {"denoiser": self.config.denoiser, **metadata}
         combiner.save(path, made, dtype=self.config.weights_dtype, metadata=said)
+
+
+def _begun(start: str, network: combiner.KernelNetwork) -> Params:
+    """The weights of that name, which must be of this network."""
+    found = files.read(start)
+    if found.network != network:
+        raise ValueError(f"start is {start!r}, {found.network}; what is trained is {network}.")
+    return found.params
 
 
 def _combined(network: combiner.KernelNetwork, params: Params, batch: Mapping[str, Array]) -> Array:

@@ -8,6 +8,7 @@ from typing import Any, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax.traverse_util import flatten_dict
 from jaxtyping import Array, Float
 
 from progden_jax import _checks, denoisers
@@ -20,7 +21,6 @@ from progden_jax.sure import sure
 from progden_jax.training import augment, data, evaluation, losses, order
 from progden_jax.training.config import DenoiserConfig
 from progden_jax.training.normalization import BATCH, BatchNormalized, pooled
-from progden_jax.training.start import match
 
 _BUFFERS = ("albedo", "normal", "depth")
 
@@ -149,8 +149,23 @@ def _begun(start: str, network: Network) -> Network:
         wide = cast(LogNetwork, found).with_inputs(network.inputs)
     except ValueError as error:
         raise ValueError(f"start is {start!r}: {error}") from None
-    match(start, wide.params, network.params)
+    ours, theirs = _shapes(network), _shapes(wide)
+    for name in [*ours, *theirs]:
+        if ours.get(name) != theirs.get(name):
+            raise ValueError(
+                f"start is {start!r}, which has {_said(theirs.get(name))} weights {name}; this configuration "
+                f"makes {_said(ours.get(name))}: give it the options that those weights were trained with."
+            )
     return wide
+
+
+def _shapes(network: Network) -> dict[str, tuple[int, ...]]:
+    flat: dict[str, Any] = flatten_dict(network.params, sep=".")
+    return {name: value.shape for name, value in flat.items()}
+
+
+def _said(shape: tuple[int, ...] | None) -> str:
+    return "no" if shape is None else "×".join(map(str, shape))
 
 
 def _frame(example: Mapping[str, Array]) -> Frame:

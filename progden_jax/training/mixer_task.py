@@ -24,7 +24,6 @@ from progden_jax.sure import sure
 from progden_jax.training import augment, data, evaluation, losses
 from progden_jax.training.config import CombinerConfig, MixerConfig
 from progden_jax.training.estimates import EstimateCache
-from progden_jax.training.start import match
 from progden_jax.tstatistic import t_bound
 
 _WITHOUT_PROBES: dict[str, Method] = {
@@ -76,9 +75,7 @@ class MixerTask:
         if denoiser is None:
             denoiser = denoisers.load(config.denoiser)
         check_exposure(config, denoiser)
-        jax.eval_shape(
-            self.init, jax.random.key(0)
-        )  # says what is wrong with the start, if anything
+        self._start = _begun(config.start, self.architecture) if config.start else None
         tangents = config.loss == "sure" and config.sure_derivative == "probe"
         method = build_method(config)
         self.cache = EstimateCache(denoiser, method, cache_folder, tangents=tangents)
@@ -90,16 +87,7 @@ class MixerTask:
         self.held_out = evaluation.HeldOut(*held)
 
     def init(self, key: jax.Array) -> Params:
-        params, start = self.architecture.init(key), self.config.start
-        if not start:
-            return params
-        found = mixers.load(start)
-        if not isinstance(found, NetworkMixer) or found.architecture != self.architecture:
-            raise ValueError(
-                f"start is {start!r}, {found!r}; what is trained is {self.architecture!r}."
-            )
-        match(start, found.params, params)
-        return found.params
+        return self.architecture.init(key) if self._start is None else self._start
 
     def example(
         self, arrays: Mapping[str, Array], index: Array, key: jax.Array
@@ -164,6 +152,14 @@ class MixerTask:
         """Write weights that `progden denoise --mixer` takes."""
         mixer = NetworkMixer(params, self.architecture)
         save_mixer(path, mixer, denoiser=self.config.denoiser, **metadata)
+
+
+def _begun(start: str, architecture: Architecture) -> Params:
+    """The weights of that name, which must be of this architecture."""
+    found = mixers.load(start)
+    if not isinstance(found, NetworkMixer) or found.architecture != architecture:
+        raise ValueError(f"start is {start!r}, {found!r}; what is trained is {architecture!r}.")
+    return found.params
 
 
 def swapped_alpha(
