@@ -1,6 +1,7 @@
 """A convolution whose derivative by the kernel is a few large matrix products, for CPUs."""
 
 import functools
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import jax
@@ -8,32 +9,42 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from progden_jax import _points
+
 _STRIP = 256
-"""Pixels whose taps are gathered at once: few enough for them to stay in a core's cache."""
+"""Rows of a product, pixels or cells of them, that are gathered at once: few enough for a core's cache."""
 
 _WIDE = 128
 """Channels from which XLA copies part by part what is joined; below, it asks for each value whose it is."""
 
-_NEARLY_WIDE = 96
-"""Channels on one side that do beside `_WIDE` on the other: faster than all taps on one side."""
+_CELL = 4
+"""Pixels of a row, at most, that share the products of `_by_points`; as long as its points are few."""
+
+_LEAST = 24
+"""Outputs that these must have to be worth their sums."""
 
 
 def by_products(inputs: Array, kernel: Array, precision: Any) -> Array:
-    """The convolution again, in a form whose transpose by the kernel is one product per strip of rows.
+    """The convolution again, in a form whose transpose by the kernel is a few products per strip of rows.
 
-    For that the taps of rows are gathered on one side of the product and those of columns on the other or,
-    where channels are few, all taps on the side that has fewer.
+    Where channels are many, taps of rows are gathered and those of columns met at points; where they are
+    few, all taps are gathered on the side that has fewer.
     """
-    (kh, kw, ci, co), (_, h, width, _) = kernel.shape, inputs.shape
+    (kh, kw, ci, co), (n, h, width, _) = kernel.shape, inputs.shape
     if (kh, kw) == (1, 1):
-        return jnp.matmul(inputs, kernel[0, 0], precision=precision)
-    height = max(d for d in range(1, h + 1) if h % d == 0 and d * width <= max(width, _STRIP))
-    if kh * ci >= _WIDE and kw * co >= _NEARLY_WIDE:
-        return _by_rows_and_columns(inputs, kernel, height, precision)
-    if kw == 3 and width % 2 == 0 and 2 * kh * ci >= _WIDE and 4 * co >= _WIDE:
-        return _by_cells(inputs, kernel, height, precision)
+        # A product over several axes at once would first be transposed.
+        flat = jnp.matmul(inputs.reshape(-1, ci), kernel[0, 0], precision=precision)
+        return flat.reshape(n, h, width, co)
+    cell = min(_CELL, _points.MOST_POINTS + 1 - kw)
+    if cell > 1 and 2 * kh * ci >= _WIDE and co >= _LEAST:
+        return _by_points(inputs, kernel, cell, precision)
     by_taps = _by_output_taps if co < ci else _by_input_taps
-    return by_taps(inputs, kernel, height, precision)
+    return by_taps(inputs, kernel, _height(h, width), precision)
+
+
+def _height(rows: int, width: int) -> int:
+    """Rows of a strip."""
+    return max(d for d in range(1, rows + 1) if rows % d == 0 and d * width <= max(width, _STRIP))
 
 
 def _by_strips(one: Any, kernel: Array, images: int, strips: int) -> Array:
@@ -51,49 +62,41 @@ def _rows_of(padded: Array, image: Array, start: Array, height: int) -> Array:
     return lax.dynamic_slice(padded, (image, start, 0, 0), (1, height, width, channels))[0]
 
 
-def _tall(padded: Array, image: Array, strip: Array, height: int, taps: int) -> Array:
-    """Of each pixel of the strip those above and below it side by side, (height, w, taps · channels)."""
-    rows = _rows_of(padded, image, strip * height, height + taps - 1)
-    return jnp.concatenate([rows[i : i + height] for i in range(taps)], axis=-1)
-
-
-def _by_rows_and_columns(inputs: Array, kernel: Array, height: int, precision: Any) -> Array:
+def _by_points(inputs: Array, kernel: Array, cell: int, precision: Any) -> Array:
+    """A cell of so many pixels of a row is a short correlation, see `_points.correlation`: fewer products."""
     (kh, kw, ci, co), (n, h, w, _) = kernel.shape, inputs.shape
-    padded = jnp.pad(inputs, ((0, 0), (kh // 2,) * 2, (0, 0), (0, 0)))
-    matrix = jnp.moveaxis(kernel, 2, 1).reshape(kh * ci, kw * co)
+    spread, values, back = _points.correlation(cell, kw)
+    # Taps of zeros fill up what is joined.
+    taps = max(kh, -(-_WIDE // ci))
+    cells = -(-w // cell)
+    height = _height(h, cells)
+    rows, columns = (kh // 2, kh // 2 + taps - kh), (kw // 2, kw // 2 + cells * cell - w)
+    padded = jnp.pad(inputs, ((0, 0), rows, columns, (0, 0)))
+    filled = jnp.pad(kernel, ((0, taps - kh), (0, 0), (0, 0), (0, 0)))
+    at_points = jnp.einsum(
+        "pj,ijco->poic", jnp.asarray(values, kernel.dtype), filled, precision="highest"
+    ).reshape(len(values), co, taps * ci)
 
-    def one(image: Array, strip: Array, matrix: Array) -> Array:
-        tall = _tall(padded, image, strip, height, kh)
-        columns = lax.split(jnp.matmul(tall, matrix, precision=precision), (co,) * kw, axis=2)
-        moved = (_moved(c, 0, kw // 2 - j) for j, c in enumerate(columns))
-        return functools.reduce(jnp.add, moved)
+    def one(image: Array, strip: Array, at_points: Array) -> Array:
+        found = _rows_of(padded, image, strip * height, height + taps - 1)
+        tall = jnp.concatenate([found[i : i + height] for i in range(taps)], axis=-1)
+        pixels = [tall[:, i : i + cell * cells : cell] for i in range(cell + kw - 1)]
+        pixels = [p.reshape(height * cells, taps * ci) for p in pixels]
+        # The kernel's channels last: else its derivative would have the larger side first, which is slower.
+        products = [
+            lax.dot_general(_sum(s, pixels), m, (((1,), (1,)), ((), ())), precision=precision)
+            for s, m in zip(spread, at_points, strict=True)
+        ]
+        made = [_sum(s, products).reshape(height, cells, co) for s in back]
+        return jnp.stack(made, axis=2).reshape(height, cells * cell, co)[:, :w]
 
-    return _by_strips(one, matrix, n, h // height).reshape(n, h, w, co)
+    return _by_strips(one, at_points, n, h // height).reshape(n, h, w, co)
 
 
-def _by_cells(inputs: Array, kernel: Array, height: int, precision: Any) -> Array:
-    """As `_by_rows_and_columns` where channels are too few for it, on cells of two pixels of a row.
-
-    A cell meets itself, the first pixel of the next cell and the last of the one before; a quarter of the
-    products are zeros.
-    """
-    (kh, _, ci, co), (n, h, w, _) = kernel.shape, inputs.shape
-    cells = inputs.reshape(n, h, w // 2, 2 * ci)
-    padded = jnp.pad(cells, ((0, 0), (kh // 2,) * 2, (0, 0), (0, 0)))
-    zero = jnp.zeros((kh, ci, co), kernel.dtype)
-    left, middle, right = (kernel[:, j] for j in range(3))
-    # From each pixel of the cell: to its two, to the next one's first, to the last one's second.
-    first = jnp.concatenate([middle, left, zero, right], axis=-1)
-    second = jnp.concatenate([right, middle, left, zero], axis=-1)
-    matrix = jnp.stack([first, second], axis=1).reshape(2 * kh * ci, 4 * co)
-
-    def one(image: Array, strip: Array, matrix: Array) -> Array:
-        tall = _tall(padded, image, strip, height, kh)
-        products = jnp.matmul(tall, matrix, precision=precision)
-        own, after, before = lax.split(products, (2 * co, co, co), axis=2)
-        return own + jnp.concatenate([_moved(after, 0, 1), _moved(before, 0, -1)], axis=-1)
-
-    return _by_strips(one, matrix, n, h // height).reshape(n, h, w, co)
+def _sum(weights: Iterable[float], parts: Sequence[Array]) -> Array:
+    """The weighted sum of those that count."""
+    terms = (float(a) * p for a, p in zip(weights, parts, strict=True) if a)
+    return functools.reduce(jnp.add, terms)
 
 
 def _by_input_taps(inputs: Array, kernel: Array, height: int, precision: Any) -> Array:

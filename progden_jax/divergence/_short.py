@@ -4,31 +4,18 @@ Along one axis, a convolution of a window x with a kernel w is
 
     y = combine · ((points · w) ∘ (spread · x))
 
-with small constant matrices: polynomials are multiplied by their values at a few points (Toom and Cook), and
-outputs that all inputs around reach are the transpose of that (Winograd; Lavin and Gray, "Fast
-algorithms for convolutional neural networks", CVPR 2016). In two dimensions the matrices act along both
-axes, and what remains between are products of channels, as many as the square of the points. What moves, cuts
-or repeats the window on its way is part of the matrices too.
+with small constant matrices, see `progden_jax._points`: polynomials are multiplied by their values at a few
+points, and outputs that all inputs around reach are the transpose of that. In two dimensions the matrices
+act along both axes, and what remains between are products of channels, as many as the square of the points.
+What moves, cuts or repeats the window on its way is part of the matrices too.
 """
 
 import dataclasses
-import functools
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
-MOST_POINTS = 7
-"""At more points rounding grows: 1.5e-6 relative at 7 in float32, 6e-7 at 6, 3e-7 by plain sums."""
-
-# Of some 28,000 sets of simple fractions those that round among the least; one more point is at infinity.
-_FINITE = {
-    3: (0, 1),
-    4: (0, 1, -1),
-    5: (0, 1, -2, -1 / 2),
-    6: (0, 3 / 2, -3 / 2, 2 / 3, -2 / 3),
-    7: (0, 1, -1, 1 / 2, 3, -5 / 8),
-}
+from progden_jax._points import MOST_POINTS, correlation, product
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,14 +56,14 @@ def convolution(source: int, target: int, shift: np.ndarray, taps: int) -> Axis:
     tiles, width = _tiling(target, taps - 1)
     reached, count = source + taps - 1, len(shift)
     if (source == 1 or reached <= MOST_POINTS) and reached < tiles * (width + taps - 1):
-        spread, kernel, back = _product(source, taps)
+        spread, kernel, back = product(source, taps)
         rows = np.arange(target) + shift[:, None] + taps - 1
         inside = (rows >= 0) & (rows < reached)
         combine = np.where(inside[..., None], back[np.clip(rows, 0, reached - 1)], 0)
         spread, points = np.broadcast_to(spread, (count, *spread.shape)), kernel[:, ::-1]
         tiles, start = 1, np.zeros(count, int)
     else:
-        gather, points, back = _correlation(width, taps)
+        gather, points, back = correlation(width, taps)
         combine = np.broadcast_to(back, (count, *back.shape))
         if tiles == 1:
             # The offset is part of the matrix.
@@ -106,7 +93,7 @@ def upsampled_convolution(
     for second, size in enumerate(((width + 1) // 2, width // 2)):
         if not size:
             continue
-        gather, kernel, back = _correlation(size, fewer)
+        gather, kernel, back = correlation(size, fewer)
         folded = []
         for kind in kinds:
             seen = (kind + second - reach + np.arange(taps)) // 2
@@ -139,38 +126,3 @@ def _placed(matrix: np.ndarray, starts: np.ndarray, width: int) -> np.ndarray:
     columns = starts[:, None] + np.arange(matrix.shape[1])
     hits = columns[:, :, None] == np.arange(width)
     return np.einsum("pc,fcw->fpw", matrix, hits)
-
-
-@functools.cache
-def _correlation(outputs: int, taps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """gather, kernel and back of y_o = Σ_t w_t x_{o+t}: the transpose of the product of polynomials."""
-    if 1 in (outputs, taps):
-        count = outputs + taps - 1
-        alike = np.eye(count)
-        return (
-            alike,
-            alike if outputs == 1 else np.ones((count, 1)),
-            alike if taps == 1 else np.ones((1, count)),
-        )
-    values, kernel, back = _product(outputs, taps)
-    return back.T, kernel, values.T
-
-
-@functools.cache
-def _product(n: int, m: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """a, b, back: the product of polynomials of coefficients x and w has back · ((a x) ∘ (b w))."""
-    if 1 in (n, m):
-        alike = np.eye(n + m - 1)
-        return (
-            alike if m == 1 else np.ones((m, 1)),
-            alike if n == 1 else np.ones((n, 1)),
-            alike,
-        )
-    a, b, whole = (_values(_FINITE[n + m - 1], count) for count in (n, m, n + m - 1))
-    return a, b, np.linalg.inv(whole)
-
-
-def _values(finite: Sequence[float], count: int) -> np.ndarray:
-    """What takes a polynomial's coefficients to its values at points, at infinity to the highest one."""
-    highest = np.eye(count)[-1:]
-    return np.concatenate([np.vander(finite, count, increasing=True), highest])
