@@ -17,9 +17,6 @@ _STRIP = 256
 _WIDE = 128
 """Channels from which XLA copies part by part what is joined; below, it asks for each value whose it is."""
 
-_CELL = 4
-"""Pixels of a row, at most, that share the products of `_by_points`; as long as its points are few."""
-
 _LEAST = 24
 """Outputs that these must have to be worth their sums."""
 
@@ -35,9 +32,8 @@ def by_products(inputs: Array, kernel: Array, precision: Any) -> Array:
         # A product over several axes at once would first be transposed.
         flat = jnp.matmul(inputs.reshape(-1, ci), kernel[0, 0], precision=precision)
         return flat.reshape(n, h, width, co)
-    cell = min(_CELL, _points.MOST_POINTS + 1 - kw)
-    if cell > 1 and 2 * kh * ci >= _WIDE and co >= _LEAST:
-        return _by_points(inputs, kernel, cell, precision)
+    if kw < _points.MOST_POINTS and 2 * kh * ci >= _WIDE and co >= _LEAST:
+        return _by_points(inputs, kernel, precision)
     by_taps = _by_output_taps if co < ci else _by_input_taps
     return by_taps(inputs, kernel, _height(h, width), precision)
 
@@ -62,9 +58,11 @@ def _rows_of(padded: Array, image: Array, start: Array, height: int) -> Array:
     return lax.dynamic_slice(padded, (image, start, 0, 0), (1, height, width, channels))[0]
 
 
-def _by_points(inputs: Array, kernel: Array, cell: int, precision: Any) -> Array:
-    """A cell of so many pixels of a row is a short correlation, see `_points.correlation`: fewer products."""
+def _by_points(inputs: Array, kernel: Array, precision: Any) -> Array:
+    """A cell of pixels of a row is a short correlation, see `_points.correlation`: fewer products."""
     (kh, kw, ci, co), (n, h, w, _) = kernel.shape, inputs.shape
+    sizes = range(2, _points.MOST_POINTS + 2 - kw)
+    cell = min(sizes, key=lambda size: -(-w // size) * (size + kw - 1))
     spread, values, back = _points.correlation(cell, kw)
     # Taps of zeros fill up what is joined.
     taps = max(kh, -(-_WIDE // ci))

@@ -283,8 +283,8 @@ def assert_near(found, expected):
 
 @pytest.mark.parametrize(
     "shape",
-    [(1, 1, 3, 2), (3, 5, 3, 2), (3, 5, 2, 5), (5, 3, 13, 32), (5, 3, 26, 32)],
-    ids=["1x1", "output taps", "input taps", "cells", "rows and columns"],
+    [(1, 1, 3, 2), (3, 5, 3, 2), (3, 5, 2, 5), (3, 7, 24, 24), (5, 3, 13, 24), (3, 5, 43, 24)],
+    ids=["1x1", "output taps", "input taps", "wide", "points, rows filled up", "points"],
 )
 def test_convolution_and_its_derivatives(shape, monkeypatch):
     """In each form that the derivative by the kernel has, of more than one strip."""
