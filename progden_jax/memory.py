@@ -94,6 +94,25 @@ def trim() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
+HUGE_PAGES = "glibc.malloc.hugetlb=1"
+"""What asks for huge pages, in the environment variable ``GLIBC_TUNABLES`` of a new process."""
+
+_PAGES = Path("/sys/kernel/mm/transparent_hugepage/enabled")
+
+
+def huge_pages() -> bool:
+    """Whether what this process allocates comes in huge pages, as far as Linux can find some.
+
+    Images are too large for the C library to keep what was freed: each run touches all its pages anew.
+    """
+    try:
+        chosen = _PAGES.read_text()
+    except OSError:
+        return False
+    asked = HUGE_PAGES in os.environ.get("GLIBC_TUNABLES", "")
+    return "[always]" in chosen or ("[madvise]" in chosen and asked)
+
+
 def window_edge(
     available: float,
     smallest: int,

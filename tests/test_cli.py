@@ -936,7 +936,7 @@ def test_devices(progden):
     assert found["versions"]["pyoidn"]
     assert found["cache"]["folder"] == os.environ["PROGDEN_CACHE"]
     status, stdout, _ = progden("devices")
-    for text in (str(jax.devices()[0]), jax.__version__, found["cache"]["folder"]):
+    for text in (str(jax.devices()[0]), jax.__version__, found["cache"]["folder"], "huge pages"):
         assert text in stdout
 
 

@@ -139,6 +139,24 @@ def test_only_what_is_asked_for_is_given(images):
         pd.progressive_denoise(frame, denoiser, outputs="image")
 
 
+@pytest.mark.parametrize(
+    ("system", "tunables", "expected"),
+    [
+        ("always [madvise] never", "", False),
+        ("always [madvise] never", f"glibc.malloc.tcache_count=1:{memory.HUGE_PAGES}", True),
+        ("[always] madvise never", "", True),
+        ("always madvise [never]", memory.HUGE_PAGES, False),
+        (None, memory.HUGE_PAGES, False),
+    ],
+)
+def test_whether_memory_comes_in_huge_pages(system, tunables, expected, tmp_path, monkeypatch):
+    if system is not None:
+        (tmp_path / "enabled").write_text(system)
+    monkeypatch.setattr(memory, "_PAGES", tmp_path / "enabled")
+    monkeypatch.setenv("GLIBC_TUNABLES", tunables)
+    assert memory.huge_pages() == expected
+
+
 def test_the_wider_of_denoiser_and_mixer_is_what_memory_is_guessed_from(near_sighted):
     """The shipped mixer's first layer takes 54 channels and gives 32; the denoiser's last 8 and 25."""
     oidn = pd.denoisers.load("oidn-hdr")

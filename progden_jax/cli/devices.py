@@ -28,6 +28,8 @@ def devices(
         return
     from rich.table import Table
 
+    from progden_jax.memory import HUGE_PAGES
+
     table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
     for d in found["devices"]:
         memory = "" if d["memory"] is None else f", {_size(d['memory'])} of memory"
@@ -35,6 +37,10 @@ def devices(
         table.add_row("device", f"{d['id']}: {d['kind']} ({d['platform']}){memory}{used}")
     for name, version in found["versions"].items():
         table.add_row(name, version or "not installed")
+    huge = found["huge_pages"]
+    table.add_row(
+        "huge pages", "yes" if huge else f"no (GLIBC_TUNABLES={HUGE_PAGES} asks for them)"
+    )
     cache = found["cache"]
     table.add_row("compilation cache", f"{cache['folder']} ({_size(cache['bytes'])})")
     tables().print(table, highlight=False, markup=False, soft_wrap=True)
@@ -43,7 +49,7 @@ def devices(
 def _collect() -> dict[str, Any]:
     import jax
 
-    from progden_jax import __version__
+    from progden_jax import __version__, memory
     from progden_jax.compilation import cache_folder
 
     folder = cache_folder()
@@ -64,6 +70,7 @@ def _collect() -> dict[str, Any]:
             **{name: _version(name) for name in ("jax", "jaxlib", "pyoidn", "OpenEXR")},
             "python": sys.version.split()[0],
         },
+        "huge_pages": memory.huge_pages(),
         "cache": {"folder": folder, "bytes": _bytes_below(folder)},
     }
 
