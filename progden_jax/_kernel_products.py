@@ -25,7 +25,7 @@ def by_products(inputs: Array, kernel: Array, precision: Any) -> Array:
     """The convolution again, in a form whose transpose by the kernel is a few products per strip of rows.
 
     Where channels are many, taps of rows are gathered and those of columns met at points; where they are
-    few, all taps are gathered on the side that has fewer.
+    few, all taps are gathered: of the inputs only if these are clearly fewer.
     """
     (kh, kw, ci, co), (n, h, width, _) = kernel.shape, inputs.shape
     if (kh, kw) == (1, 1):
@@ -34,7 +34,7 @@ def by_products(inputs: Array, kernel: Array, precision: Any) -> Array:
         return flat.reshape(n, h, width, co)
     if kw < _points.MOST_POINTS and 2 * kh * ci >= _WIDE and co >= _LEAST:
         return _by_points(inputs, kernel, precision)
-    by_taps = _by_output_taps if co < ci else _by_input_taps
+    by_taps = _by_output_taps if 2 * co <= 3 * ci else _by_input_taps
     return by_taps(inputs, kernel, _height(h, width), precision)
 
 

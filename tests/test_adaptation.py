@@ -225,7 +225,7 @@ def test_one_pixel_is_its_own_mean():
     frame = pd.Frame(np.full((1, 1, 3), 2.0, np.float32), np.ones((1, 1, 3), np.float32))
     seen = combination.guides_of(frame, frame.color, combination.units_of(frame))
     params = drawn(jax.eval_shape(SMALL.init, jax.random.key(0)))
-    np.testing.assert_allclose(jax.jit(SMALL.apply)(params, seen), 1, rtol=1e-6)
+    np.testing.assert_allclose(jax.jit(SMALL.apply)(params, seen[None]), 1, rtol=1e-6)
 
 
 def test_the_networks_are_those_of_table_1():

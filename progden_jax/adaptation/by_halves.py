@@ -140,7 +140,7 @@ def loss(
     A half's noise is independent of the other's, so that this is the relative error of μ̂ and what does not
     depend on the weights.
     """
-    corrected = jax.vmap(functools.partial(correction.apply, params))(examples["guides"])
+    corrected = correction.apply(params, examples["guides"])
     return ((corrected - examples["target"]) ** 2 / examples["norm"]).mean()
 
 
@@ -166,5 +166,4 @@ def _step(
 
 @functools.partial(jax.jit, static_argnums=0)
 def _corrected(correction: PostCorrection, params: Params, guides: Array, frame: Frame) -> Array:
-    parts = jax.vmap(functools.partial(correction.apply, params))(guides)
-    return combination.units_of(frame).radiance * parts.mean(0)
+    return combination.units_of(frame).radiance * correction.apply(params, guides).mean(0)

@@ -2,10 +2,12 @@
 
 All that belongs to one pixel is one array, its guides, (H, W, 13): noisy colour y, denoised colour z, albedo
 ρ, normal n, and depth in the place of the paper's visibility, which renderers seldom write. Weights are made
-and used one offset of the window at a time, in the derivative too.
+and used a few offsets of the window at a time, in the derivative too.
 """
 
-from collections.abc import Callable, Iterator
+import functools
+import itertools
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -13,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from progden_jax import _checks
-from progden_jax._neighbourhood import Shifted, some_outputs, weighted_sums
+from progden_jax._neighbourhood import some_outputs
 from progden_jax.frame import Frame
 
 GUIDES = {"noisy": 3, "denoised": 3, "albedo": 3, "normal": 3, "depth": 1}
@@ -21,16 +23,20 @@ GUIDES = {"noisy": 3, "denoised": 3, "albedo": 3, "normal": 3, "depth": 1}
 
 CHANNELS = sum(GUIDES.values())
 
-_RADIANCE = slice(0, 2)
-"""Guides whose squared differences are taken by their logarithm."""
+_RADIANCE = 2
+"""So many first guides whose squared differences are taken by their logarithm."""
 
 _EPSILON = 1e-4
 
 _LEAST = 1e-6
 """Weight that every pixel has for itself besides: where all others vanish, derivatives must not overflow."""
 
-Weigh = Callable[[Array, Float[Array, "5 h w"]], Float[Array, "h w"]]
-"""From an offset's number in raster order and the squared distances of the guides there to its weight."""
+_UNROLLED = 4
+"""Offsets whose sums XLA makes together, each in its own loop else."""
+
+Weigh = Callable[[Array, Sequence[Array]], Float[Array, "h w"]]
+"""From an offset's number in raster order and the squared distances (H, W) of the five guides there to its
+weight."""
 
 
 class Units(NamedTuple):
@@ -101,18 +107,29 @@ def combine(
     """
     _checks.image("guides", guides, channels=CHANNELS)
     _checks.odd_int("window", window)
-    # The last that is summed is 1 inside the image: it sums the weights. Depth only weighs.
-    ones = jnp.ones_like(guides[..., :1])
-    planes = jnp.concatenate([guides[..., :-1], ones, guides[..., -1:]], axis=-1).transpose(2, 0, 1)
+    # Each channel by itself: joined ones XLA tells apart value by value.
+    centers = [guides[..., n] for n in range(CHANNELS)]
+    # Depth only weighs; what stands after the others is 1 inside the image, and so sums the weights.
+    summed = [*centers[:-1], jnp.ones_like(centers[0])]
+    border = window // 2
+    padded = [jnp.pad(plane, border) for plane in [*summed, centers[-1]]]
 
-    def weights_of(index: Array, shifted: Shifted) -> Array:
-        squares = (shifted(index) - planes) ** 2
-        distances = jnp.concatenate([squares[: CHANNELS - 1], squares[CHANNELS:]])
-        return weigh(index, jnp.stack(list(_by_guide(distances))))[None]
+    @jax.checkpoint
+    def part(index: Array) -> list[Array]:
+        corner = (index // window, index % window)
+        there = [jax.lax.dynamic_slice(plane, corner, guides.shape[:2]) for plane in padded]
+        pairs = zip([*there[:-2], there[-1]], centers, strict=True)
+        squares = iter([(a - b) ** 2 for a, b in pairs])
+        squared = [_total(itertools.islice(squares, n)) for n in GUIDES.values()]
+        weight = weigh(index, squared)
+        return [weight * plane for plane in there[:-1]]
 
-    total = weighted_sums(planes, weights_of, window=window, summed=CHANNELS)
-    total = total + _LEAST * planes[:CHANNELS]
-    means = (total[:-1] / total[-1]).transpose(1, 2, 0)
+    def add(total: list[Array], index: Array) -> tuple[list[Array], None]:
+        return jax.tree.map(jnp.add, total, part(index)), None
+
+    start = [_LEAST * plane for plane in summed]
+    *sums, weights = jax.lax.scan(add, start, jnp.arange(window**2), unroll=_UNROLLED)[0]
+    means = jnp.stack([plane / weights for plane in sums], axis=-1)
     differences = guides[..., 3:12] - means[..., 3:]
     if scales is None:
         return means[..., :3] + differences[..., :3]
@@ -120,11 +137,8 @@ def combine(
     return means[..., :3] + scaled[..., :3] + scaled[..., 3:6] + scaled[..., 6:]
 
 
-def _by_guide(squares: Float[Array, "13 h w"]) -> Iterator[Float[Array, "h w"]]:
-    start = 0
-    for channels in GUIDES.values():
-        yield squares[start : start + channels].sum(0)
-        start += channels
+def _total(parts: Iterable[Array]) -> Array:
+    return functools.reduce(jnp.add, parts)
 
 
 def bilateral(
@@ -134,12 +148,13 @@ def bilateral(
 
     Squared distances of radiance count by log(1 + ·). Back et al. 2022, Eq. 11.
     """
-    falloff = (1 / (bandwidths**2 + _EPSILON)).transpose(2, 0, 1)
+    falloff = [1 / (bandwidths[..., n] ** 2 + _EPSILON) for n in range(len(GUIDES))]
 
-    def weigh(index: Array, squared: Array) -> Array:
-        distances = squared.at[_RADIANCE].set(jnp.log1p(squared[_RADIANCE]))
-        weight = jnp.exp(-(distances * falloff).sum(0))
-        return jnp.where(index == window**2 // 2, center[..., 0], weight)
+    def weigh(index: Array, squared: Sequence[Array]) -> Array:
+        radiance, others = squared[:_RADIANCE], squared[_RADIANCE:]
+        distances = [*(jnp.log1p(s) for s in radiance), *others]
+        exponent = _total(d * f for d, f in zip(distances, falloff, strict=True))
+        return jnp.where(index == window**2 // 2, center[..., 0], jnp.exp(-exponent))
 
     return weigh
 
@@ -149,7 +164,7 @@ def predicted(
 ) -> Weigh:
     """Weights that a network's last layer predicts, one output per offset, through a softplus."""
 
-    def weigh(index: Array, squared: Array) -> Array:
+    def weigh(index: Array, squared: Sequence[Array]) -> Array:
         del squared
         return jax.nn.softplus(some_outputs(features[None], kernel, bias, index, 1)[0, 0])
 

@@ -116,8 +116,8 @@ class PostCorrection:
             last["bias"] = last["bias"].at[:3].set(2)
         return params
 
-    def apply(self, params: Params, guides: Float[Array, "h w 13"]) -> Float[Array, "h w 3"]:
-        """The corrected image of a noisy and a denoised one, see `combination.guides_of`, in their units."""
+    def apply(self, params: Params, guides: Float[Array, "n h w 13"]) -> Float[Array, "n h w 3"]:
+        """The corrected images of noisy and denoised ones, see `combination.guides_of`, in their units."""
         last = params[f"conv{self.layers}"]
         radiance = jnp.log1p(jnp.maximum(guides[..., :6], 0))
         h = jnp.concatenate([radiance, guides[..., 6:]], axis=-1)
@@ -130,17 +130,20 @@ class PostCorrection:
             scales = jnp.tanh(_layer(head, h))
             kernel, bias = kernel[..., _SCALES:], bias[_SCALES:]
         if self.bilateral:
-            positive = jax.nn.softplus(_layer({"kernel": kernel, "bias": bias}, h))
-            weigh = combination.bilateral(
-                positive[..., :-1], positive[..., -1:], window=self.window
-            )
-        else:
-            weigh = combination.predicted(h, kernel, bias)
-        return combination.combine(guides, weigh, scales=scales, window=self.window)
+            h = jax.nn.softplus(_layer({"kernel": kernel, "bias": bias}, h))
+
+        def combined(guides: Array, h: Array, scales: Array | None) -> Array:
+            if self.bilateral:
+                weigh = combination.bilateral(h[..., :-1], h[..., -1:], window=self.window)
+            else:
+                weigh = combination.predicted(h, kernel, bias)
+            return combination.combine(guides, weigh, scales=scales, window=self.window)
+
+        return jax.vmap(combined)(guides, h, scales)
 
 
 def _layer(layer: Mapping[str, Array], h: Array) -> Array:
-    return same_convolution(h[None], layer["kernel"], "highest")[0] + layer["bias"]
+    return same_convolution(h, layer["kernel"], "highest") + layer["bias"]
 
 
 SETTINGS = {
@@ -194,10 +197,10 @@ class PostCorrected(Around):
         def f(x: Array) -> Array:
             shift = self.difference.get("color")
             colors = (x,) if shift is None else (x + shift, x - shift)
-            found = []
-            for (part, denoise), color in zip(bound, colors, strict=True):
-                guides = combination.guides_of(part.replace(color=color), denoise(color), units)
-                found.append(self.correction.apply(self.params, guides))
-            return units.radiance * sum(found) / len(found)
+            guides = [
+                combination.guides_of(part.replace(color=color), denoise(color), units)
+                for (part, denoise), color in zip(bound, colors, strict=True)
+            ]
+            return units.radiance * self.correction.apply(self.params, jnp.stack(guides)).mean(0)
 
         return f

@@ -81,7 +81,7 @@ def combine(
     def sums_of(buffer: Array, planes: Float[Array, "4 n h w"]) -> Float[Array, "4 n h w"]:
         count = rows * window
         return weighted_sums(
-            planes, lambda first, _: weigh(buffer, first, count), window=window, at_once=count
+            planes, lambda first: weigh(buffer, first, count), window=window, at_once=count
         )
 
     planes = jnp.moveaxis(both, -1, 1)
