@@ -516,7 +516,7 @@ def test_weights_as_files(trained, tmp_path):
 
 
 def test_configurations(renders):
-    assert config.names(CombinerConfig) == ("cpu", "paper", "smoke")
+    assert config.names(CombinerConfig) == ("cpu", "paper", "smoke", "wide")
     for name in config.names(CombinerConfig):
         KernelNetwork(**config.load(CombinerConfig, name).options)
     for changes, message in (
