@@ -18,7 +18,7 @@ from code_generation import users_environment
 from exr_files import planes, read_channels, stack, write
 
 import progden_jax as pd
-from progden_jax import demo, pipeline
+from progden_jax import demo, memory, pipeline
 from progden_jax.cli import _options, _run, app, main
 from progden_jax.exr import read_exr, write_exr
 
@@ -935,6 +935,7 @@ def test_devices(progden):
     assert found["versions"]["jax"] == jax.__version__
     assert found["versions"]["pyoidn"]
     assert found["cache"]["folder"] == os.environ["PROGDEN_CACHE"]
+    assert found["huge_pages"] == memory.huge_pages()
     status, stdout, _ = progden("devices")
     for text in (str(jax.devices()[0]), jax.__version__, found["cache"]["folder"], "huge pages"):
         assert text in stdout

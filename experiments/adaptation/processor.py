@@ -1,9 +1,10 @@
 """What a fit takes of the processors: by this the steps of `equal_time.yaml` were chosen.
 
-    python -m experiments.adaptation.processor [experiments/adaptation/equal_time.yaml] [--steps 10]
+    python -m experiments.adaptation.processor [experiments/adaptation/equal_time.yaml] [--steps 60]
 
 Per method that fits anything the seconds of a step, all threads added up, so that other work on the machine
-counts little, and those of all its steps. Looks at the blocks that choose are part of it.
+counts little, and those of all its steps. Looks at the blocks that choose are part of it, and what a fit begins
+with: few steps would seem to take long.
 """
 
 import dataclasses
@@ -28,7 +29,7 @@ PART = {"sure": "fitting", "sure-correct": "fitting", "post-correct": "correctio
 def main() -> None:
     parser = _common.parser(__doc__)
     parser.add_argument("config", type=Path, nargs="?", default=CONFIG, help="of a sweep")
-    parser.add_argument("--steps", type=int, default=10, help="to time of each fit")
+    parser.add_argument("--steps", type=int, default=60, help="to time of each fit")
     arguments = parser.parse_args()
     pd.enable_compilation_cache()
     print(_common.machine() + "\n")
