@@ -3,8 +3,8 @@
     python -m experiments.adaptation.processor [experiments/adaptation/equal_time.yaml] [--steps 60]
 
 Per method that fits anything the seconds of a step, all threads added up, so that other work on the machine
-counts little, and those of all its steps. Looks at the blocks that choose are part of it, and what a fit begins
-with: few steps would seem to take long.
+counts little, and those of all its steps. Looks at the blocks that choose are part of it, and what a fit
+begins with: few steps would seem to take long.
 """
 
 import dataclasses
