@@ -13,7 +13,7 @@ import pytest
 from conftest import counting_compilations
 
 import progden_jax as pd
-from progden_jax import mixers
+from progden_jax import combiner, denoisers, mixers
 from progden_jax.cli import main
 from progden_jax.denoisers import KPCN, UNet
 from progden_jax.training import (
@@ -24,6 +24,7 @@ from progden_jax.training import (
     Trainer,
     config,
     losses,
+    mixer_task,
     order,
     train,
 )
@@ -370,9 +371,10 @@ def test_training_by_sure_alone(folder, render, tmp_path, monkeypatch):
     changes = {"architecture": "tilt", "options": {}, "draws": 2, "swap": 0.0}
     changes |= {"loss": "sure", "sure_derivative": "probe", "exposure_stops": 0.0}
     task = MixerTask(_config(folder, **changes), denoiser=Blur(), cache_folder=tmp_path)
-    assert task.arrays["divergence"].shape == (4, 2, SIZE, SIZE, 3)
-    arrays = {n: a if n == "mean_variance" else a[:1] for n, a in task.arrays.items()}
-    arrays["divergence"] = arrays["divergence"][:, 0]
+    assert task.arrays["divergence"].shape == (4, 2, 1, SIZE, SIZE, 3)
+    arrays = {n: a[:1] for n, a in task.arrays.items()}
+    arrays |= {n: arrays[n][:, 0] for n in ("denoised", "probe", "tangent")}
+    arrays["divergence"] = arrays["divergence"][:, 0, 0]
     np.testing.assert_allclose(np.abs(arrays["probe"][0]), np.sqrt(render.variance), rtol=1e-5)
     params = task.init(None)
 
@@ -398,6 +400,42 @@ def test_training_by_sure_alone(folder, render, tmp_path, monkeypatch):
     loss, found = jax.jit(jax.value_and_grad(lambda p: task.loss(p, batch)[0]))(params)
     np.testing.assert_allclose(loss, expected, rtol=1e-3)
     assert np.isfinite(found["slope"])
+
+
+def test_a_mixer_for_several_denoisers(folder, tmp_path):
+    """Each render's image is by any of them, with its own divergence; held out are those of all."""
+    changes = {"further": ["unet-hdr"], "flips": False, "turns": False, "permute_colors": False}
+    task = MixerTask(_config(folder, **changes, crop=SIZE), denoiser=Blur(), cache_folder=tmp_path)
+    alone = [
+        MixerTask(_config(folder), denoiser=denoiser, cache_folder=tmp_path)
+        for denoiser in (Blur(), denoisers.load("unet-hdr"))
+    ]
+    assert (task.cache.misses, [each.cache.misses for each in alone]) == (12, [0, 0])
+    keys = jax.random.split(jax.random.key(0), 16)
+    arrays = jax.tree.map(jnp.asarray, task.arrays)
+    examples = jax.vmap(lambda key: task.example(arrays, 1, key))(keys)
+    seen = set()
+    for image, divergence in zip(examples["denoised"], examples["divergence"], strict=True):
+        by = [bool((image == each.arrays["denoised"][1, 0]).all()) for each in alone]
+        expected = alone[by.index(True)].arrays["divergence"][1, 0, 0]
+        np.testing.assert_array_equal(divergence, expected)
+        seen.add(by.index(True))
+    assert seen == {0, 1}
+
+    closed = pd.ClosedForm()
+    scores = [each.held_out.scores(closed) for each in (task, *alone)]
+    np.testing.assert_allclose(scores[0].score, (scores[1].score + scores[2].score) / 2, rtol=1e-5)
+    smape = [found.table["denoised"]["smape"][4] for found in scores]
+    assert smape[0] == pytest.approx((smape[1] + smape[2]) / 2)
+
+
+def test_a_combiner_behind_a_denoiser_by_name():
+    found = mixer_task._loaded("unet-hdr+nfor")
+    assert isinstance(found, combiner.DeepCombiner)
+    assert found.network == combiner.read("nfor").network
+    assert found.denoiser.name == "unet-hdr"
+    with pytest.raises(ValueError, match="denoiser is 'nothing'"):
+        mixer_task._loaded("nothing+nfor")
 
 
 def test_risk_of_the_mix_is_unbiased():
@@ -447,7 +485,8 @@ def test_losses_and_the_bound(trainer, monkeypatch, loss, bound):
     monkeypatch.setattr(task, "config", dataclasses.replace(task.config, **changes))
     monkeypatch.setattr(task, "architecture", Tilt())
     batch = {name: jnp.asarray(a[:2]) for name, a in task.arrays.items()}
-    batch["divergence"], batch["swap"] = batch["divergence"][:, 0], jnp.asarray([False, True])
+    batch["divergence"], batch["swap"] = batch["divergence"][:, 0, 0], jnp.asarray([False, True])
+    batch["denoised"] = batch["denoised"][:, 0]
     x, y, v, d = (batch[n] for n in ("color", "denoised", "variance", "divergence"))
     params = Tilt().init(None)
 

@@ -74,9 +74,10 @@ class RunConfig:
 
 @dataclasses.dataclass(frozen=True)
 class MixerConfig(RunConfig):
-    """How to train a mixing network for one denoiser."""
+    """How to train a mixing network for one denoiser, or for several."""
 
-    denoiser: str = "oidn-hdr"  # name or weights file of the denoiser whose output is mixed in
+    denoiser: str = "oidn-hdr"  # whose output is mixed in: name or weights file, or NAME+COMBINER
+    further: tuple[str, ...] = ()  # more denoisers, each render's image by one of all at random
     method: str = "monte-carlo"  # of the divergence behind SURE, as `progden denoise --method`
     probes: int = 1  # of that method, where it takes them
     draws: int = 1  # divergences with probes of other seeds per image, one at random each time

@@ -12,7 +12,7 @@ from progden_jax import subaverages
 from progden_jax.frame import repaired
 from progden_jax.subaverages import SubAverages
 from progden_jax.training.config import Meaning, RunConfig
-from progden_jax.training.estimates import EstimateCache
+from progden_jax.training.estimates import EstimateCache, EstimateCaches
 from progden_jax.training.index import Item, earlier, index, split
 
 Progress = Callable[[int, int], None]
@@ -22,7 +22,8 @@ Progress = Callable[[int, int], None]
 class Examples(NamedTuple):
     """`arrays` are (N, H, W, C), but for mean_variance (N,) and divergence (N, draws, H, W, 3).
 
-    Of B sub-averages, parts and denoised_parts are (N, B, H, W, 3) and shares (N, B).
+    By `EstimateCaches` of D denoisers, denoised, probe and tangent are (N, D, H, W, 3) and divergence is
+    (N, draws, D, H, W, 3). Of B sub-averages, parts and denoised_parts are (N, B, H, W, 3) and shares (N, B).
     """
 
     items: tuple[Item, ...]
@@ -38,7 +39,7 @@ def load(
     items: Sequence[Item],
     *,
     variance_of: Meaning = "mean",
-    cache: EstimateCache | None = None,
+    cache: EstimateCache | EstimateCaches | None = None,
     draws: int = 1,
     auxiliary: Sequence[str] = (),
     parts: int = 1,
@@ -93,6 +94,8 @@ def load(
             if found[0].probe is not None:
                 row["probe"], row["tangent"] = found[0].probe, found[0].tangent
         if parts > 1:
+            if isinstance(cache, EstimateCaches):
+                raise ValueError("sub-averages are of one denoiser.")
             row |= _parts(item, frame, parts, variance_of, cache)
         for name, value in row.items():
             rows.setdefault(name, []).append(np.asarray(value, np.float32))
@@ -103,7 +106,7 @@ def load(
 def load_split(
     config: RunConfig,
     *,
-    cache: EstimateCache | None = None,
+    cache: EstimateCache | EstimateCaches | None = None,
     draws: int = 1,
     auxiliary: Sequence[str] = (),
     parts: int = 1,

@@ -5,9 +5,9 @@ They depend on render, denoiser, method and seed alone, and cost far more than a
 
 import functools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import numpy as np
@@ -124,6 +124,29 @@ class EstimateCache:
             with replacing(path) as temporary:
                 temporary.write_bytes(save(arrays, {"digest": fingerprint(*arrays.values())}))
         return arrays
+
+
+class EstimateCaches:
+    """Estimates of several denoisers at once: each array has an axis of them in front, (D, H, W, 3)."""
+
+    def __init__(self, caches: Sequence[EstimateCache]) -> None:
+        self.caches = tuple(caches)
+
+    @property
+    def hits(self) -> int:
+        """How many estimates were on disk."""
+        return sum(cache.hits for cache in self.caches)
+
+    @property
+    def misses(self) -> int:
+        """How many were computed."""
+        return sum(cache.misses for cache in self.caches)
+
+    def get(self, frame: Frame, seed: int = 0) -> Estimate:
+        """As `EstimateCache.get`."""
+        found = [cache.get(frame, seed) for cache in self.caches]
+        stacked = (None if a[0] is None else np.stack(a) for a in zip(*found, strict=True))
+        return Estimate(*cast(Any, stacked))
 
 
 def _read(

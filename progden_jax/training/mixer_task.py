@@ -2,13 +2,15 @@
 
 import os
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from progden_jax import denoisers, mixers
+from progden_jax import combiner, denoisers, mixers
 from progden_jax.denoisers import OIDN, Denoiser
 from progden_jax.divergence import (
     Exact,
@@ -23,7 +25,7 @@ from progden_jax.mixers.architectures import Architecture, Params
 from progden_jax.sure import sure
 from progden_jax.training import augment, data, evaluation, losses
 from progden_jax.training.config import CombinerConfig, MixerConfig
-from progden_jax.training.estimates import EstimateCache
+from progden_jax.training.estimates import EstimateCache, EstimateCaches
 from progden_jax.tstatistic import t_bound
 
 _WITHOUT_PROBES: dict[str, Method] = {
@@ -43,14 +45,17 @@ METHODS: dict[str, Callable[[int], Method]] = {
 }
 """Estimators by the names that `progden denoise --method` has for them, of a number of probes."""
 
+_ESTIMATED = ("denoised", "probe", "tangent")
+"""Arrays with an axis of denoisers, as divergences have behind that of their draws."""
+
 
 class MixerTask:
-    """A mixing network for one denoiser; see `loop.Task`.
+    """A mixing network for one denoiser, or for several; see `loop.Task`.
 
     Parameters
     ----------
     config : what to train on and how; `config.data` names the folders.
-    denoiser : instead of loading the one that the configuration names.
+    denoiser : instead of loading the first one that the configuration names.
     cache_folder : of denoised images and divergences, by default `estimates.default_folder()`.
     progress : called with how many of how many renders are loaded.
 
@@ -72,19 +77,22 @@ class MixerTask:
     ) -> None:
         self.config = config
         self.architecture = build(config.architecture, config.options)
-        if denoiser is None:
-            denoiser = denoisers.load(config.denoiser)
-        check_exposure(config, denoiser)
+        first = _loaded(config.denoiser) if denoiser is None else denoiser
+        chosen = [first, *map(_loaded, config.further)]
+        for each in chosen:
+            check_exposure(config, each)
         self._start = _begun(config.start, self.architecture) if config.start else None
         tangents = config.loss == "sure" and config.sure_derivative == "probe"
         method = build_method(config)
-        self.cache = EstimateCache(denoiser, method, cache_folder, tangents=tangents)
+        self.cache = EstimateCaches(
+            [EstimateCache(each, method, cache_folder, tangents=tangents) for each in chosen]
+        )
         examples, held = data.load_split(
             config, cache=self.cache, draws=config.draws, progress=progress
         )
         self.size = examples.size
         self.items, self.arrays = examples
-        self.held_out = evaluation.HeldOut(*held)
+        self.held_out = evaluation.HeldOut(*_of_each(held))
 
     def init(self, key: jax.Array) -> Params:
         return self.architecture.init(key) if self._start is None else self._start
@@ -94,9 +102,11 @@ class MixerTask:
     ) -> dict[str, Array]:
         """One augmented example, with ``swap`` among its entries."""
         draw_key, change_key, swap_key = jax.random.split(key, 3)
-        picked = {name: array[index] for name, array in arrays.items() if name != "divergence"}
         which = jax.random.randint(draw_key, (), 0, self.config.draws)
-        picked["divergence"] = arrays["divergence"][index, which]
+        # A number of its own beside those that one denoiser takes.
+        of = jax.random.randint(jax.random.fold_in(key, 8), (), 0, 1 + len(self.config.further))
+        chosen = {**dict.fromkeys(_ESTIMATED, (index, of)), "divergence": (index, which, of)}
+        picked = {name: array[chosen.get(name, index)] for name, array in arrays.items()}
         change = augment.draw(change_key, self.size, self.config)
         changed = augment.apply(change, picked, crop=self.config.crop)
         changed["swap"] = jax.random.bernoulli(swap_key, self.config.swap)
@@ -152,6 +162,28 @@ class MixerTask:
         """Write weights that `progden denoise --mixer` takes."""
         mixer = NetworkMixer(params, self.architecture)
         save_mixer(path, mixer, denoiser=self.config.denoiser, **metadata)
+
+
+def _loaded(name: str) -> Denoiser:
+    """The denoiser of that name or file, or of NAME+COMBINER with the combiner behind it."""
+    before, plus, behind = name.partition("+")
+    if not plus or Path(name).exists():
+        return denoisers.load(name)
+    return combiner.load(behind, denoisers.load(before))
+
+
+def _of_each(held: data.Examples) -> data.Examples:
+    """What several denoisers make of the renders as examples of their own, with one divergence each."""
+    arrays = {**held.arrays, "divergence": held.arrays["divergence"][:, 0]}
+    count = arrays["denoised"].shape[1]
+    flat = {
+        name: array.reshape(-1, *array.shape[2:])
+        if name in (*_ESTIMATED, "divergence")
+        else np.repeat(array, count, axis=0)
+        for name, array in arrays.items()
+    }
+    flat["divergence"] = flat["divergence"][:, None]
+    return data.Examples(tuple(item for item in held.items for _ in range(count)), flat)
 
 
 def _begun(start: str, architecture: Architecture) -> Params:
