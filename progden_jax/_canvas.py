@@ -13,8 +13,12 @@ from progden_jax.survey import BUFFERS, crop, frame_of
 
 
 def canvas_size(n: int) -> int:
-    """`n` pixels rounded up so that there are eight sizes per doubling, multiples of 16."""
-    step = max(16, 1 << max(n.bit_length() - 4, 0))
+    """`n` pixels rounded up to a multiple of 16: eight sizes per doubling, sixteen from 1024 on.
+
+    The larger an image, the less its program's compilation matters beside what is computed for nothing.
+    """
+    length = n.bit_length()
+    step = max(16, 1 << max(length - (5 if n > 1024 else 4), 0))
     return -(-n // step) * step
 
 

@@ -1,5 +1,6 @@
 """Frames computed window by window, on the host's buffers, into images on the host."""
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple, cast
 
@@ -35,12 +36,12 @@ class Place(NamedTuple):
 
 def fits(job: Any, frame: Frame, canvas: tuple[int, int], max_memory: int) -> bool:
     """Whether the frame can be computed at once, as far as can be told without compiling."""
-    needed = _guess(job) + _pixel_bytes(frame) * len(job.outputs)
+    needed = _guess(job, canvas) + _pixel_bytes(frame) * len(job.outputs)
     return canvas[0] * canvas[1] * needed * memory.SLACK <= max_memory
 
 
-def _guess(job: Any) -> float:
-    return memory.guess(job.denoiser, job.method, getattr(job, "mixer", None))
+def _guess(job: Any, size: tuple[int, int]) -> float:
+    return memory.guess(job.denoiser, job.method, getattr(job, "mixer", None), size)
 
 
 def _pixel_bytes(frame: Frame) -> int:
@@ -69,7 +70,7 @@ def within(
             max_memory - kept,
             tiling.smallest_window(reach, step),
             lambda edge: _compiled(job, frame, divergence, edge),
-            _guess(job),
+            lambda pixels: _guess(job, (math.isqrt(pixels), math.isqrt(pixels))),
         )
         shape = (edge, edge)
     assert shape is not None

@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import functools
 import math
 import os
 import re
@@ -94,6 +95,29 @@ def trim() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
+def trim_for(pixels: int) -> None:
+    """Before an image of so many is computed: `trim` if it is large, now and after each compilation.
+
+    A program's peak would else come on top of what the compiler has left, or the frame before.
+    """
+    if pixels >= _WORTH_TRIMMING:
+        trim()
+        _trim_after_compiling()
+
+
+_WORTH_TRIMMING = 1 << 20
+"""Pixels of a frame."""
+
+
+@functools.cache
+def _trim_after_compiling() -> None:
+    def listen(event: str, duration_secs: float, **_: Any) -> None:
+        if event == "/jax/core/compile/backend_compile_duration" and duration_secs > 0.3:
+            trim()
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+
+
 HUGE_PAGES = "glibc.malloc.hugetlb=1"
 """What asks for huge pages, in the environment variable ``GLIBC_TUNABLES`` of a new process."""
 
@@ -117,7 +141,7 @@ def window_edge(
     available: float,
     smallest: int,
     needs: Callable[[int], Any],
-    guess: float,
+    guess: Callable[[int], float],
 ) -> int:
     """The edge of the largest square window whose program fits into so many bytes.
 
@@ -126,7 +150,7 @@ def window_edge(
     available : bytes for one window's program: its arguments, results and temporaries.
     smallest : the least edge that is of use.
     needs : the compiled program for a window of that edge, as `jax.stages.Compiled`.
-    guess : bytes per pixel to start from; too many costs speed, too few a second compilation.
+    guess : of a window's pixels, bytes for each, to start from; too many cost speed, too few a compilation.
 
     Raises
     ------
@@ -135,8 +159,8 @@ def window_edge(
     """
     edges = tiling.window_edges(smallest)
 
-    def largest(bytes_per_pixel: float) -> int:
-        fitting = [n for n in edges if n * n * bytes_per_pixel * SLACK <= available]
+    def largest(bytes_of_each: Callable[[int], float]) -> int:
+        fitting = [n for n in edges if n * n * bytes_of_each(n * n) * SLACK <= available]
         return fitting[-1] if fitting else smallest
 
     edge = largest(guess)
@@ -152,7 +176,7 @@ def window_edge(
                 f"{edge}×{edge} pixels, takes {shown(least)}: give at least "
                 f"{shown(least - available)} more, or a smaller network."
             )
-        edge = min(largest(per_pixel), edges[edges.index(edge) - 1])
+        edge = min(largest(lambda _, known=per_pixel: known), edges[edges.index(edge) - 1])
 
 
 def bytes_of(compiled: Any) -> int:
@@ -161,11 +185,17 @@ def bytes_of(compiled: Any) -> int:
     return found.temp_size_in_bytes + found.argument_size_in_bytes + found.output_size_in_bytes
 
 
-def guess(denoiser: Any, method: Any, mixer: Any = None) -> float:
-    """Bytes per pixel that a window's program may take, from the widest layers at full resolution."""
+def guess(denoiser: Any, method: Any, mixer: Any = None, size: tuple[int, int] = (0, 0)) -> float:
+    """Bytes per pixel that the program of a window of that size may take, from the widest layers."""
     chunk = getattr(method, "chunk", None) or 1
     network = _widest(denoiser, 128) * chunk
-    return 4 * 2.3 * max(network, _widest(mixer, 0))
+    banded = getattr(denoiser, "in_bands", None)
+    share = _OF_BANDS if banded is not None and banded(*size) else 1
+    return 4 * 2.3 * share * max(network, _widest(mixer, 0))
+
+
+_OF_BANDS = 0.3
+"""Of the memory of a whole image, what bands of it take; from 0.11 to 0.36 for OIDN's networks."""
 
 
 def _widest(network: Any, otherwise: int) -> int:

@@ -7,6 +7,7 @@ from typing import Protocol
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from progden_jax import _checks, _windows
@@ -172,6 +173,15 @@ def _closed_form_alpha(
     mixed = usable & (bias > 0) & (bias < total)
     share = jnp.where(mixed, bias, 0) / jnp.where(mixed, total, 1)
     return jnp.where(usable & (bias < total), 1 - share, 0)
+
+
+def level_of(
+    x: Float[Array, "h w 3"], inside: Bool[Array, "h w 1"] | None = None
+) -> Float[Array, ""]:
+    """Mean over pixels and channels of the radiance above 0, a constant in derivatives; see `Mixer`."""
+    counted = jnp.ones_like(x[..., :1]) if inside is None else inside.astype(x.dtype)
+    radiance = lax.stop_gradient(jnp.maximum(x, 0)) * counted
+    return radiance.sum() / (3 * counted.sum())
 
 
 class Mixer(Protocol):

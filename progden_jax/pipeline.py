@@ -7,7 +7,7 @@ import jax
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from progden_jax import _checks, _windowed, skipping, tiling
+from progden_jax import _checks, _windowed, memory, skipping, tiling
 from progden_jax._canvas import call_of, canvas_size, cropped, has_canvas
 from progden_jax._devices import Device
 from progden_jax._program import OUTPUTS, Denoised, Job, PlainJob, Result, checked_variance
@@ -166,6 +166,7 @@ def rule_of(skip: Skip | bool, job: Job) -> Skip | None:
 
 
 def _at_once(job: Any, frame: Frame, divergence: Array | None, canvas: tuple[int, int]) -> Any:
+    memory.trim_for(canvas[0] * canvas[1])
     return cropped(job.program(job, *call_of(job, frame, canvas, divergence)), frame.size)
 
 

@@ -12,7 +12,9 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from progden_jax import _checks
-from progden_jax.denoisers import graph
+from progden_jax._numeric import own_zero
+from progden_jax._slopes import pointwise
+from progden_jax.denoisers import _stages, graph
 from progden_jax.denoisers._base import Bound, Bounded, call
 from progden_jax.denoisers.graph import Layered, Node
 from progden_jax.frame import Frame
@@ -126,6 +128,10 @@ class Network:
         """Pixels after which the way that outputs depend on inputs repeats."""
         return graph.alignment(self.nodes)
 
+    def in_bands(self, height: int, width: int) -> bool:
+        """Whether an image of that size goes in bands of rows, which take a part of the whole's memory."""
+        return _stages.are_several(self.nodes, height, width)
+
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.name!r}, inputs={self.inputs})"
 
@@ -192,13 +198,13 @@ def _run_bound(f: BoundNetwork, x: Array) -> Array:
     y = run(
         nodes,
         params,
-        (f._encode(x), *f.auxiliary),
+        (pointwise(f.denoiser.encode, x, f.exposure), *f.auxiliary),
         valid=f.valid,
         precision=f.denoiser.precision,
     )
-    y = f._decode(y)
+    y = pointwise(f.denoiser.decode, y, f.exposure)
     inside = inside_of(x.shape[:2], f.valid)
-    return y if inside is None else jnp.where(inside, y, 0)
+    return y if inside is None else jnp.where(inside, y, own_zero(y))
 
 
 def run(
@@ -213,10 +219,10 @@ def run(
     x = jnp.concatenate(channels, axis=-1)
     inside = inside_of(x.shape[:2], valid)
     if inside is not None:
-        x = jnp.where(inside, x, 0)
+        x = jnp.where(inside, x, own_zero(x))
     height, width = x.shape[:2]
     x, aligned = _padded(x, valid, graph.alignment(nodes))
-    y, _ = graph.evaluate(
+    y = _stages.evaluate(
         nodes,
         params,
         x,

@@ -5,7 +5,7 @@ order of evaluation, each naming those it reads. Strides are powers of two; a no
 value per 2^n × 2^n pixels.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -14,6 +14,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from progden_jax._numeric import own_zero
+from progden_jax._slopes import largest, where_passes
 from progden_jax.denoisers.layers import (
     Moments,
     Weighted,
@@ -214,19 +215,40 @@ def evaluate(
     `precision` is that of the convolutions: JAX's, or "bfloat16", which rounds their inputs and kernels to
     that and sums in float32, tangents likewise.
     """
+    masks = mask_pyramid(inside, max(levels(nodes)))
+    given, rest = {0: inputs}, range(1, len(nodes))
+    values, kept = evaluate_part(nodes, params, given, rest, masks=masks, precision=precision)
+    return values[len(nodes) - 1], kept
+
+
+def evaluate_part(
+    nodes: Sequence[Node],
+    params: Any,
+    given: Mapping[int, Float[Array, "h w c"]],
+    which: range,
+    *,
+    masks: Sequence[Array] | None = None,
+    precision: Any = lax.Precision.HIGHEST,
+    lean: bool = False,
+) -> tuple[dict[int, Float[Array, "h w c"]], dict[int, Any]]:
+    """The values of some nodes from those of the nodes that they read; for the rest see `evaluate`.
+
+    `masks` are a `mask_pyramid` of at least the levels that occur. `lean`: what is linearised keeps a bit for
+    each ReLU and a byte for each pool, which takes a little longer to compile and to run.
+    """
     strides = levels(nodes)
-    masks = _mask_pyramid(inside, max(strides))
     bare = _not_bounded(nodes)
-    values: list[Array] = []
+    values = dict(given)
     kept: dict[int, Any] = {}
 
     def bounded(value: Array, level: int) -> Array:
         return value if masks is None else jnp.where(masks[level], value, 0)
 
-    for index, (node, level) in enumerate(zip(nodes, strides, strict=True)):
+    for index in which:
+        node, level = nodes[index], strides[index]
         match node:
             case Input():
-                value = inputs
+                raise ValueError(f"node {index} is the input, and its value is not given.")
             case Conv():
                 first, *others = node.sources
                 if isinstance(nodes[first], Upsample) and folds(params[node.layer], precision):
@@ -246,7 +268,8 @@ def evaluate(
                 if masks is not None:
                     passes &= masks[level]
                 kept[index] = passes
-                value = jnp.where(passes, values[node.source], own_zero(values[node.source]))
+                x = values[node.source]
+                value = where_passes(passes, x) if lean else jnp.where(passes, x, own_zero(x))
             case LeakyRelu():
                 x = values[node.source]
                 kept[index] = x > 0
@@ -261,10 +284,9 @@ def evaluate(
                 value, slope = jax.jvp(node.function, (x,), (jnp.ones_like(x),))
                 value, kept[index] = bounded(value, level), bounded(slope, level)
             case MaxPool():
-                kept[index] = jnp.argmax(jnp.stack(children(values[node.source])), axis=0).astype(
-                    jnp.uint8
-                )
-                value = max_pool(values[node.source])
+                four = children(values[node.source])
+                kept[index] = jnp.argmax(jnp.stack(four), axis=0).astype(jnp.uint8)
+                value = largest(*four) if lean else max_pool(values[node.source])
             case Upsample():
                 value = upsample(values[node.source])
             case Add():
@@ -273,8 +295,8 @@ def evaluate(
                 mask = None if masks is None else masks[level]
                 kept[index] = filtered(values[node.image], values[node.logits], node.size, mask)
                 value = kept[index].result
-        values.append(value)
-    return values[-1], kept
+        values[index] = value
+    return values, kept
 
 
 def _not_bounded(nodes: Sequence[Node]) -> set[int]:
@@ -288,7 +310,8 @@ def _not_bounded(nodes: Sequence[Node]) -> set[int]:
     }
 
 
-def _mask_pyramid(inside: Array | None, top: int) -> list[Array] | None:
+def mask_pyramid(inside: Array | None, top: int) -> list[Array] | None:
+    """At each level up to the top, where there is any of the image."""
     if inside is None:
         return None
     pyramid = [inside]

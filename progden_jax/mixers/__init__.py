@@ -14,8 +14,9 @@ from flax.traverse_util import flatten_dict
 from jaxtyping import Array, Bool, Float
 
 from progden_jax import _safetensors
+from progden_jax._bands import in_bands, rows_of
 from progden_jax.mixers.architectures import ARCHITECTURES, Architecture, Params, build, name_of
-from progden_jax.mixing import ClosedForm, Mixer
+from progden_jax.mixing import ClosedForm, Mixer, level_of
 
 __all__ = [
     "ARCHITECTURES",
@@ -71,11 +72,18 @@ class NetworkMixer:
         level: Float[Array, ""] | None = None,
     ) -> Float[Array, "h w 3"]:
         """α in [0, 1], (H, W, 3); see `Mixer`."""
+        rows = max(rows_of(*x.shape[:2]), 8 * self.receptive_radius)
+        if level is None and rows < x.shape[0]:
+            level = level_of(x, inside)
+        known = (x, y, variance, divergence, sure, *(() if inside is None else (inside,)))
+
+        def applied(*known: Array) -> Array:
+            *images, there = (*known, None) if inside is None else known
+            return self.architecture.apply(self.params, *images, inside=there, level=level)
+
         # GPUs would else take TF32.
         with jax.default_matmul_precision("highest"):
-            return self.architecture.apply(
-                self.params, x, y, variance, divergence, sure, inside=inside, level=level
-            )
+            return in_bands(applied, known, x.shape[0], rows=rows, halo=self.receptive_radius)
 
     @property
     def receptive_radius(self) -> int:

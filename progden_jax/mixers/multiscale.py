@@ -6,12 +6,12 @@ import functools
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from progden_jax import _checks, _windows
 from progden_jax._convolution import convolve
 from progden_jax.mixers._base import Params
+from progden_jax.mixing import level_of
 
 WINDOWS = (3, 7, 15, 31)
 """Widths in pixels of the windows that statistics are averaged over."""
@@ -159,8 +159,7 @@ def features(
 
     # In units of the image's mean no square here leaves float32's range, nor its derivatives.
     if level is None:
-        radiance = lax.stop_gradient(jnp.maximum(x, 0)) * counted
-        level = radiance.sum() / (3 * counted.sum())
+        level = level_of(x, inside)
     # A power of two rounds nothing, so that an image's tiles see its very features.
     unit = jnp.ldexp(jnp.ones_like(level), -jnp.frexp(level)[1])
     x, y, variance, divergence = unit * x, unit * y, unit**2 * variance, unit**2 * divergence
