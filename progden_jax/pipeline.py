@@ -59,7 +59,7 @@ def progressive_denoise(
     frame : one frame with a variance; map over a batch with ``jax.vmap``.
     denoiser : see `progden_jax.denoisers.load`, or any `Denoiser`.
     mixer : gives α; by default what `mixers.default_for` has for the denoiser: a network shipped for
-        it, else the closed form over 15×15 windows.
+        it, else the one for any.
     method : estimator of the divergence; by default `MonteCarlo` with one probe.
     bound : on α, without which the mix need not converge. True stands for ``Bound()``, the authors' settings;
         False leaves α as the mixer gives it.

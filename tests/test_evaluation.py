@@ -268,7 +268,7 @@ def test_crops_kept_images_and_the_risk_of_the_whole_chain(renders, tmp_path):
     config = tmp_path / "own.yaml"
     config.write_text(
         f"data: [{renders}]\nscenes: [scene1]\ncrop: 8\nkeep_images: [4]\n"
-        f"base: {{denoiser: '{TOY.replace('blur', 'dim')}', bound: false}}\n"
+        f"base: {{denoiser: '{TOY.replace('blur', 'dim')}', bound: false, mixer: closed-form}}\n"
         "list: [render, {image: mix, label: held}, {image: mix, label: whole, risk_probes: 1}]\n"
     )
     report = Remembers()

@@ -552,7 +552,9 @@ def test_performance(command, monkeypatch, tiny, tmp_path):
     printed = command(performance, "--data", DEMO, "--spp", 32, *words)
     rows = {row["part"]: row for row in _common.read_csv(output)}
     assert list(rows) == [
-        *("forward pass", "mixer features", "mixing net", "t-bound", "divergence", "whole"),
+        *("forward pass", "mixer features", "mixing net", "t-bound"),
+        *("mixer features, shipped mixer", "features and net, shipped mixer"),
+        *("divergence", "whole", "whole, shipped mixer"),
     ]
     assert all(float(row["ms"]) > 0 for row in rows.values())
     once, twice = (float(rows[part]["operations_1e9"]) for part in ("forward pass", "divergence"))

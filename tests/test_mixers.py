@@ -1,6 +1,7 @@
 """Learned mixers: architectures, weights files, padding; and the convolution that they train with."""
 
 import functools
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -98,13 +99,16 @@ def test_default_mixers(mixer, tmp_path, monkeypatch):
     mixers._shipped.cache_clear()
     blur = pd.FunctionDenoiser(lambda x: x / 2)
     assert mixers.names() == ("closed-form",)
-    assert mixers.default_for(blur) == pd.ClosedForm() == pd.load_mixer("closed-form")
-    mixers.save_mixer(tmp_path / "mixer-oidn-hdr.safetensors", mixer)
-    assert mixers.names() == ("closed-form", "oidn-hdr")
+    assert pd.load_mixer("closed-form") == pd.ClosedForm()
+    for name in ("any", "nfor", "oidn-hdr"):
+        mixers.save_mixer(tmp_path / f"mixer-{name}.safetensors", mixer)
+    assert mixers.names() == ("closed-form", "any", "nfor", "oidn-hdr")
     named = pd.denoisers.load("oidn-hdr")
     assert mixers.default_for(named).architecture == mixer.architecture
     assert mixers.default_for(named) is pd.load_mixer("oidn-hdr")
-    assert mixers.default_for(blur) == pd.ClosedForm()
+    assert mixers.default_for(blur) is pd.load_mixer("any")
+    for name, expected in (("nfor+combiner", "nfor"), ("oidn-hdr+combiner", "any")):
+        assert mixers.default_for(SimpleNamespace(name=name)) is pd.load_mixer(expected)
     mixers._shipped.cache_clear()
 
 

@@ -7,6 +7,7 @@ import pytest
 from conftest import counting_compilations
 
 import progden_jax as pd
+from progden_jax import mixers
 from progden_jax._canvas import canvas_size
 
 # Most frames here are padded to 48×48 pixels and have the same buffers, so that one program serves them.
@@ -40,7 +41,7 @@ def test_it_composes_the_public_parts(real_frame, denoiser):
         y = f(x)
         divergence = pd.divergence(f, x, variance, method=method, key=key)
         risk = pd.sure(x, y, variance, divergence)
-        alpha = pd.ClosedForm()(x, y, variance, divergence, risk)
+        alpha = mixers.default_for(denoiser)(x, y, variance, divergence, risk)
         return y, divergence, risk, pd.t_bound(alpha, x, y, variance)
 
     y, divergence, risk, alpha = compose(denoiser)

@@ -586,7 +586,7 @@ def test_data_that_will_not_do(folder, tmp_path):
 
 
 def test_configurations(tmp_path):
-    assert config.names(MixerConfig) == ("cpu", "gpu", "multiscale", "paper", "smoke")
+    assert config.names(MixerConfig) == ("any", "cpu", "gpu", "multiscale", "paper", "smoke")
     loaded = {name: config.load(MixerConfig, name) for name in config.names(MixerConfig)}
     paper = loaded["paper"]
     assert (paper.steps, paper.batch, paper.peak_rate, paper.loss) == (2_300_000, 12, 2e-5, "smape")
@@ -627,7 +627,7 @@ def test_configurations(tmp_path):
         ("base = 'nowhere.toml'", "nowhere.toml: there is no such file"),
         (
             "base = 'big'",
-            "config is 'big', expected one of cpu, gpu, multiscale, paper, smoke, or a file",
+            "config is 'big', expected one of any, cpu, gpu, multiscale, paper, smoke, or a file",
         ),
     ],
 )
@@ -665,7 +665,7 @@ def test_command(trainer, folder, tmp_path, monkeypatch, capsys):
     assert last.startswith("step 6; the best weights are of step ")
     for wrong, message in (
         ([*arguments, "--set", "crop"], "'crop' is no field=value"),
-        ([*arguments[:5], "big"], "config is 'big', expected one of cpu"),
+        ([*arguments[:5], "big"], "config is 'big', expected one of any"),
         (arguments[:6], "name folders of renders with --data"),
         ([*arguments, "--until", "0"], "--until is 0"),
     ):

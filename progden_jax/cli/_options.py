@@ -265,8 +265,8 @@ class EstimateOptions:
     mixer: Annotated[
         str | None,
         Parameter(
-            help="What gives the share of the denoised image: closed-form, the name of a denoiser that a "
-            "network is shipped for, or a .safetensors file [default: the denoiser's, else closed-form]."
+            help="What gives the share of the denoised image: the name of a denoiser that a network is "
+            "shipped for, any, closed-form, or a .safetensors file [default: the denoiser's, else any]."
         ),
     ] = None
 

@@ -48,8 +48,8 @@ it combines two sub-averages of the samples, made of each render and an earlier 
 
 _CONFIG = Parameter(
     help="A named configuration (paper, cpu, smoke, and for mixers and denoisers gpu; those that made "
-    "what is shipped: for mixers multiscale, for denoisers small, wider and kpcn, for combiners wide; for "
-    "denoisers also residual and residual-small) or a file, .toml or .yaml; it may begin with "
+    "what is shipped: for mixers multiscale and any, for denoisers small, wider and kpcn, for combiners "
+    "wide; for denoisers also residual and residual-small) or a file, .toml or .yaml; it may begin with "
     'base = "cpu" and change fields [default: cpu].'
 )
 _DATA = Parameter(

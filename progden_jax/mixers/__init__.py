@@ -19,6 +19,7 @@ from progden_jax.mixers.architectures import ARCHITECTURES, Architecture, Params
 from progden_jax.mixing import ClosedForm, Mixer, level_of
 
 __all__ = [
+    "ANY",
     "ARCHITECTURES",
     "CLOSED_FORM",
     "Architecture",
@@ -33,6 +34,12 @@ __all__ = [
 
 CLOSED_FORM = "closed-form"
 """The name of the mixer that needs no weights."""
+
+ANY = "any"
+"""The name of the network for all others: trained behind several, better than the closed form behind any."""
+
+_ALSO_FOR = {"nfor+combiner": "nfor"}
+"""Denoisers whose mixer was trained for more than that of its name."""
 
 _FOLDER = Path(__file__).parents[1] / "weights"
 _PREFIX = "mixer-"
@@ -102,7 +109,7 @@ class NetworkMixer:
 
 
 def names() -> tuple[str, ...]:
-    """The names that `load` knows: the closed form, and the denoisers that a mixer is shipped for."""
+    """The names that `load` knows: the closed form, "any", and the denoisers that a mixer is shipped for."""
     return (CLOSED_FORM, *_safetensors.shipped(_FOLDER, _PREFIX))
 
 
@@ -132,9 +139,10 @@ def load(name: str | os.PathLike[str]) -> Mixer:
 
 
 def default_for(denoiser: Any) -> Mixer:
-    """The mixer that is shipped for this denoiser, or the closed form where none is."""
-    name = getattr(denoiser, "name", None)
-    return load(name if name in names() else CLOSED_FORM)
+    """The mixer that is shipped for this denoiser, or the one for any where none is."""
+    name = str(getattr(denoiser, "name", ""))
+    name = _ALSO_FOR.get(name, name)
+    return load(name if name in names() else ANY)
 
 
 def save_mixer(
