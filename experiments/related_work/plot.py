@@ -48,6 +48,12 @@ def name(settings: Mapping[str, Any]) -> str:
     return ", ".join(parts) + (MIXED if settings["image"] == "mix" else "")
 
 
+def _rank(settings: Mapping[str, Any]) -> tuple[bool, str, bool]:
+    """The render first, a mix behind what is mixed."""
+    label = name(settings)
+    return label != "render", label.removesuffix(MIXED), label.endswith(MIXED)
+
+
 def errors(rows: Sequence[Row], metric: str) -> str:
     """Means over scenes; of mixes the worst ratio to the better of what is mixed, at the most samples."""
     means = _plots.over_scenes(rows, metric)
@@ -110,6 +116,8 @@ def convergence(rows: Sequence[Row], path: Path) -> None:
 def draw(rows: Sequence[Row], output: Path) -> str:
     """Tables, and a figure of convergence."""
     fitted = any("adaptation" in row.settings for row in rows)
+    # Rows come in the order in which they were finished.
+    rows = sorted(rows, key=lambda r: (r.scene, r.spp, _rank(r.settings)))
     stem = "fitted" if fitted else "related_work"
     convergence(rows, output / f"{stem}.png")
     named = _plots.renamed(rows, name)
