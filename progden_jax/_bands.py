@@ -35,8 +35,12 @@ def in_bands(
     halo are a `multiple` of rows. Where `height` does not divide so, f gets the whole.
     """
     halo = -(-halo // multiple) * multiple
-    counts = range(max((height - 2 * halo) // rows, 1), 0, -1)
-    count = next(n for n in counts if n == 1 or height % (multiple * n) == 0)
+    fitting = [
+        n
+        for n in range(2, height // rows + 1)
+        if height % (multiple * n) == 0 and height // n + 2 * halo <= height
+    ]
+    count = max(fitting, default=1)
     if count == 1:
         return f(*images)
     own = height // count
