@@ -194,7 +194,7 @@ def guess(denoiser: Any, method: Any, mixer: Any = None, size: tuple[int, int] =
     return 4 * 2.3 * share * max(network, _widest(mixer, 0))
 
 
-_OF_BANDS = 0.3
+_OF_BANDS = 0.23
 """Of the memory of a whole image, what bands of it take; from 0.11 to 0.36 for OIDN's networks."""
 
 
