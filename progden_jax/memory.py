@@ -189,13 +189,13 @@ def guess(denoiser: Any, method: Any, mixer: Any = None, size: tuple[int, int] =
     """Bytes per pixel that the program of a window of that size may take, from the widest layers."""
     chunk = getattr(method, "chunk", None) or 1
     network = _widest(denoiser, 128) * chunk
+    whole = 4 * 2.3 * max(network, _widest(mixer, 0))
     banded = getattr(denoiser, "in_bands", None)
-    share = _OF_BANDS if banded is not None and banded(*size) else 1
-    return 4 * 2.3 * share * max(network, _widest(mixer, 0))
+    return _BANDS * whole + _BESIDE if banded is not None and banded(*size) else whole
 
 
-_OF_BANDS = 0.23
-"""Of the memory of a whole image, what bands of it take; from 0.11 to 0.36 for OIDN's networks."""
+_BANDS, _BESIDE = 0.12, 275
+"""What bands take of a whole image's memory, and bytes per pixel of images at full size beside them."""
 
 
 def _widest(network: Any, otherwise: int) -> int:

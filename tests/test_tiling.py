@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import progden_jax as pd
-from progden_jax import memory, mixers, survey, tiling
+from progden_jax import _windowed, memory, mixers, pipeline, survey, tiling
 
 SIZES = st.integers(1, 700)
 
@@ -184,6 +184,16 @@ def test_large_images_in_bands_take_less_memory_each_pixel():
     assert tried == [edge]
     assert edge >= 1024
     assert set(asked) == {n * n for n in tiling.window_edges(288)}
+
+
+@pytest.mark.parametrize("name", ["oidn-hdr-alb-nrm", "unet-hdr-alb-nrm-var"])
+def test_a_frame_that_is_said_to_fit_in_bands_does(name):
+    """As XLA counts: of a megapixel, and with the most buffers that such networks take."""
+    denoiser, size = pd.denoisers.load(name), (1024, 1024)
+    frame = pd.Frame(*[np.zeros((*size, 3), np.float32)] * 4)
+    job = pipeline.job_of(denoiser, None, None, None, None)
+    compiled = job.program.lower(job, frame, None, tuple(map(np.int32, size))).compile()
+    assert not _windowed.fits(job, frame, size, memory.bytes_of(compiled))
 
 
 def test_what_cannot_be_cut_says_so(images, real_frame, denoiser):
