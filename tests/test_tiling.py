@@ -110,7 +110,7 @@ def test_a_frame_in_windows_is_the_whole_frame(real_frame):
     params = drawn(jax.eval_shape(architecture.init, jax.random.key(0)))
     how = {"mixer": pd.NetworkMixer(params, architecture), "key": jax.random.key(5)}
     whole = pd.progressive_denoise(frame, denoiser, **how)
-    pieces = pd.progressive_denoise(frame, denoiser, **how, max_memory=65 * 2**20)
+    pieces = pd.progressive_denoise(frame, denoiser, **how, max_memory=63 * 2**20)
     assert isinstance(pieces.image, np.ndarray)
     assert pieces.skipped.computed > whole.skipped.computed
     for name in ("image", "denoised", "sure", "divergence"):
