@@ -9,7 +9,10 @@ from jax import lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
+from progden_jax import _amx
+from progden_jax._amx_convolution import convolution
 from progden_jax._kernel_products import by_products
+from progden_jax._upsampling import corners, folded, of_cells, repeated
 
 _LAYOUT = ("NHWC", "HWIO", "NHWC")
 
@@ -38,7 +41,15 @@ _VECTOR = 4
 def _convolve(inputs: Array, kernel: Array, precision: Any) -> Array:
     missing = -inputs.shape[-1] % _VECTOR
     if kernel.shape[:2] == (1, 1):
-        return jnp.matmul(inputs, kernel[0, 0], precision=precision)
+        return jnp.matmul(inputs, kernel[0, 0], precision=_of_products(precision))
+    if planes := _amx.planes(precision, inputs, kernel):
+        return convolution(None, None, inputs, kernel, planes=planes)
+    if precision == "bfloat16":
+        return lax.conv_general_dilated(
+            *(inputs.astype(jnp.bfloat16), kernel.astype(jnp.bfloat16), (1, 1), "SAME"),
+            dimension_numbers=_LAYOUT,
+            preferred_element_type=inputs.dtype,
+        )
     if missing and jax.default_backend() == "cpu":
         inputs = jnp.pad(inputs, ((0, 0), (0, 0), (0, 0), (0, missing)))
         kernel = jnp.pad(kernel, ((0, 0), (0, 0), (0, missing), (0, 0)))
@@ -72,8 +83,13 @@ def _jvp(
         slopes.append(same_convolution(by_inputs, kernel, precision))
     if not isinstance(by_kernel, SymbolicZero):
         along = by_products if jax.default_backend() == "cpu" else _convolve
-        slopes.append(along(inputs, by_kernel, precision))
+        slopes.append(along(inputs, by_kernel, _of_products(precision)))
     return out, _total(slopes, out)
+
+
+def _of_products(precision: Any) -> Any:
+    """What matrix products of float32 take for a convolution's precision."""
+    return None if precision == "bfloat16" else precision
 
 
 def _total(slopes: list[Array], out: Array) -> Array:
@@ -99,19 +115,20 @@ def upsampled_convolution(
     pixels of each of `low`'s are one 2×2 convolution: 4 multiplications where there were 9.
     """
     channels = low.shape[-1]
-    weights = _folded(kernel[:, :, :channels])
-    joined = 0 < skip.shape[-1] <= _FEW
+    weights, rest = folded(kernel[:, :, :channels]), kernel[:, :, channels:]
+    beside = skip.shape[-1]
+    if planes := _amx.planes(precision, low, skip, kernel):
+        fine = (skip, rest) if beside else (None, None)
+        return convolution(low, weights, *fine, planes=planes)
+    joined = 0 < beside <= _FEW
     if joined:
         n, h, w, _ = low.shape
         cells = jnp.moveaxis(skip.reshape(n, h, 2, w, 2, -1), 3, 2).reshape(n, h, w, -1)
         low = jnp.concatenate([low, cells], axis=-1)
-        weights = jnp.concatenate([weights, _of_cells(kernel[:, :, channels:])], axis=2)
-    corners = lax.conv_general_dilated(
-        low, weights, (1, 1), ((1, 1), (1, 1)), dimension_numbers=_LAYOUT, precision=precision
-    )
-    out = _interleaved(corners)
-    if skip.shape[-1] and not joined:
-        out = out + same_convolution(skip, kernel[:, :, channels:], precision)
+        weights = jnp.concatenate([weights, of_cells(rest)], axis=2)
+    out = corners(low, weights, precision)
+    if beside and not joined:
+        out = out + same_convolution(skip, rest, precision)
     return out
 
 
@@ -132,43 +149,6 @@ def _upsampled_jvp(
     elif not isinstance(by_skip, SymbolicZero):
         slopes.append(same_convolution(by_skip, kernel[:, :, channels:], precision))
     if not isinstance(by_kernel, SymbolicZero):
-        both = jnp.concatenate([_repeated(low), skip], axis=-1)
-        slopes.append(by_products(both, by_kernel, precision))
+        both = jnp.concatenate([repeated(low), skip], axis=-1)
+        slopes.append(by_products(both, by_kernel, _of_products(precision)))
     return out, _total(slopes, out)
-
-
-def _repeated(low: Array) -> Array:
-    n, h, w, c = low.shape
-    wide = jnp.broadcast_to(low[:, :, None, :, None], (n, h, 2, w, 2, c))
-    return wide.reshape(n, 2 * h, 2 * w, c)
-
-
-def _folded(kernel: Float[Array, "3 3 ci co"]) -> Float[Array, "2 2 ci 4*co"]:
-    """The taps that meet one repeated pixel added, for the even and odd rows and columns of the output."""
-    for axis in (0, 1):
-        first, middle, last = (lax.index_in_dim(kernel, i, axis, keepdims=False) for i in range(3))
-        even = jnp.stack([first, middle + last], axis)
-        odd = jnp.stack([first + middle, last], axis)
-        kernel = jnp.stack([even, odd], axis=-2)
-    return kernel.reshape(*kernel.shape[:3], -1)
-
-
-def _of_cells(kernel: Float[Array, "3 3 cs co"]) -> Float[Array, "2 2 4*cs 4*co"]:
-    """The kernel on cells of 2×2 pixels as channels, for the four pixels that `_interleaved` joins."""
-    ends = ((1, 0), (0, 1))
-    parts = [jnp.pad(kernel, (i, j, (0, 0), (0, 0))) for i in ends for j in ends]
-    cells = jnp.stack(parts, axis=-2)
-    _, _, channels, _, width = cells.shape
-    cells = jnp.moveaxis(cells.reshape(2, 2, 2, 2, channels, 4 * width), 2, 1)
-    return cells.reshape(2, 2, 4 * channels, 4 * width)
-
-
-def _interleaved(corners: Float[Array, "n h+1 w+1 4*co"]) -> Float[Array, "n 2h 2w co"]:
-    """The output pixel of odd row is of the cell below and right of the corner, and so on."""
-    n, h, w, _ = corners.shape
-    h, w = h - 1, w - 1
-    split = corners.reshape(n, h + 1, w + 1, 2, 2, -1)
-    rows = [
-        jnp.stack([split[:, i : i + h, j : j + w, i, j] for j in (0, 1)], axis=3) for i in (0, 1)
-    ]
-    return jnp.stack(rows, axis=2).reshape(n, 2 * h, 2 * w, -1)

@@ -46,32 +46,36 @@ def where_passes(
 @where_passes.defjvp
 def _where_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
     passes, value = primals
-    count = next(n for n in (8, 4, 2, 1) if passes.shape[0] % n == 0)
-    return where_passes(passes, value), _selected(_packed(passes, count), tangents[1], count)
+    count = bits_for(passes.shape[0])
+    return where_passes(passes, value), _selected(packed(passes, count), tangents[1], count)
 
 
 # Checkpoints, so that linearising keeps what these are given, and not the masks that they make of it.
 
 
 @functools.partial(jax.checkpoint, prevent_cse=False, static_argnums=2)
-def _selected(packed: Array, tangent: Array, count: int) -> Array:
-    return jnp.where(_unpacked(packed, count), tangent, own_zero(tangent))
+def _selected(passes: Array, tangent: Array, count: int) -> Array:
+    return jnp.where(unpacked(passes, count), tangent, own_zero(tangent))
 
 
-def _packed(mask: Bool[Array, "h w c"], count: int) -> Array:
+def bits_for(height: int) -> int:
+    """How many rows go in a byte each."""
+    return next(n for n in (8, 4, 2, 1) if height % n == 0)
+
+
+def packed(mask: Bool[Array, "*n h w c"], count: int) -> UInt8[Array, "*n h2 w c"]:
     """So many rows in one byte: along rows, what is side by side stays so."""
-    if count == 1:
-        return mask
-    rows = mask.reshape(-1, count, *mask.shape[1:]).astype(jnp.uint8)
-    return functools.reduce(jnp.bitwise_or, [rows[:, bit] << bit for bit in range(count)])
+    *n, height, width, channels = mask.shape
+    rows = mask.astype(jnp.uint8).reshape(*n, height // count, count, width, channels)
+    bits = [rows[..., bit, :, :] << bit for bit in range(count)]
+    return functools.reduce(jnp.bitwise_or, bits)
 
 
-def _unpacked(packed: UInt8[Array, "h2 w c"], count: int) -> Bool[Array, "h w c"]:
-    if count == 1:
-        return packed
+def unpacked(mask: UInt8[Array, "*n h2 w c"], count: int) -> Bool[Array, "*n h w c"]:
+    *n, height, width, channels = mask.shape
     shifts = jnp.arange(count, dtype=jnp.uint8)[:, None, None]
-    rows = (packed[:, None] >> shifts) & 1
-    return rows.reshape(-1, *packed.shape[1:]) != 0
+    rows = (mask[..., None, :, :] >> shifts) & 1
+    return rows.reshape(*n, height * count, width, channels) != 0
 
 
 @jax.custom_jvp

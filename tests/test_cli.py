@@ -18,7 +18,7 @@ from code_generation import users_environment
 from exr_files import planes, read_channels, stack, write
 
 import progden_jax as pd
-from progden_jax import demo, memory, pipeline
+from progden_jax import _amx, demo, memory, pipeline
 from progden_jax.cli import _options, _run, app, main
 from progden_jax.exr import read_exr, write_exr
 
@@ -936,8 +936,16 @@ def test_devices(progden):
     assert found["versions"]["pyoidn"]
     assert found["cache"]["folder"] == os.environ["PROGDEN_CACHE"]
     assert found["huge_pages"] == memory.huge_pages()
+    assert (found["amx"] is None) == _amx.available()
     status, stdout, _ = progden("devices")
-    for text in (str(jax.devices()[0]), jax.__version__, found["cache"]["folder"], "huge pages"):
+    amx = "AMX, for convolutions" if found["amx"] is None else found["amx"]
+    for text in (
+        str(jax.devices()[0]),
+        jax.__version__,
+        found["cache"]["folder"],
+        "huge pages",
+        amx,
+    ):
         assert text in stdout
 
 

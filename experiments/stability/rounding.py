@@ -8,6 +8,9 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 TF32_MANTISSA = 10
 
+_ROUNDED = {"conv_general_dilated": 2, "amx_convolution": 4}
+"""Convolution -> how many of its operands, the first, are images and kernels."""
+
 
 def tf32(f: Any) -> jax.tree_util.Partial:
     """f with the inputs of its convolutions rounded as TensorFloat-32 rounds them, tangents likewise."""
@@ -32,8 +35,9 @@ def _run(program: Jaxpr, constants: list[Any], inputs: list[Any]) -> list[Any]:
         if isinstance(inner, ClosedJaxpr):
             results = _run(inner.jaxpr, list(inner.consts), operands)
         else:
-            if equation.primitive is lax.conv_general_dilated_p:
-                operands = [lax.reduce_precision(a, 8, TF32_MANTISSA) for a in operands]
+            count = _ROUNDED.get(equation.primitive.name, 0)
+            rounded = [lax.reduce_precision(a, 8, TF32_MANTISSA) for a in operands[:count]]
+            operands = [*rounded, *operands[count:]]
             results = equation.primitive.bind(*operands, **equation.params)
             if not equation.primitive.multiple_results:
                 results = [results]

@@ -41,6 +41,7 @@ def devices(
     table.add_row(
         "huge pages", "yes" if huge else f"no (GLIBC_TUNABLES={HUGE_PAGES} asks for them)"
     )
+    table.add_row("matrix units", found["amx"] or "AMX, for convolutions on the CPU")
     cache = found["cache"]
     table.add_row("compilation cache", f"{cache['folder']} ({_size(cache['bytes'])})")
     tables().print(table, highlight=False, markup=False, soft_wrap=True)
@@ -49,7 +50,7 @@ def devices(
 def _collect() -> dict[str, Any]:
     import jax
 
-    from progden_jax import __version__, memory
+    from progden_jax import __version__, _amx, memory
     from progden_jax.compilation import cache_folder
 
     folder = cache_folder()
@@ -71,6 +72,7 @@ def _collect() -> dict[str, Any]:
             "python": sys.version.split()[0],
         },
         "huge_pages": memory.huge_pages(),
+        "amx": (why := _amx.status()) and f"not used: {why}",
         "cache": {"folder": folder, "bytes": _bytes_below(folder)},
     }
 

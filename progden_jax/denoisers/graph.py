@@ -20,12 +20,14 @@ from progden_jax.denoisers.layers import (
     Weighted,
     children,
     convolve,
+    convolve_rectified,
     convolve_upsampled,
     filtered,
     folds,
     max_pool,
     normalized,
     patches,
+    rectifies,
     upsample,
 )
 from progden_jax.denoisers.nodes import (
@@ -240,29 +242,46 @@ def evaluate_part(
     bare = _not_bounded(nodes)
     values = dict(given)
     kept: dict[int, Any] = {}
+    like = next(iter(given.values()))
+    joined = {
+        i
+        for i, conv in _rectified(nodes, which).items()
+        if rectifies(params[conv.layer], precision, like)
+    }
 
     def bounded(value: Array, level: int) -> Array:
         return value if masks is None else jnp.where(masks[level], value, 0)
+
+    def read(conv: Any) -> tuple[Array | None, list[Array]]:
+        """What comes upsampled, where that joins the convolution, and the rest."""
+        first, *others = conv.sources
+        if isinstance(nodes[first], Upsample) and folds(params[conv.layer], precision):
+            return values[sources(nodes[first])[0]], [values[s] for s in others]
+        return None, [values[s] for s in conv.sources]
 
     for index in which:
         node, level = nodes[index], strides[index]
         match node:
             case Input():
                 raise ValueError(f"node {index} is the input, and its value is not given.")
+            case Conv() if index in joined:
+                continue
             case Conv():
-                first, *others = node.sources
-                if isinstance(nodes[first], Upsample) and folds(params[node.layer], precision):
-                    low = values[sources(nodes[first])[0]]
-                    value = convolve_upsampled(
-                        params[node.layer], low, [values[s] for s in others], precision
-                    )
+                layer = params[node.layer]
+                low, others = read(node)
+                if low is None:
+                    value = convolve(layer, jnp.concatenate(others, axis=-1), precision)
                 else:
-                    x = jnp.concatenate([values[s] for s in node.sources], axis=-1)
-                    value = convolve(params[node.layer], x, precision)
+                    value = convolve_upsampled(layer, low, others, precision)
                 if index in bare:
                     extent = jnp.ones((*value.shape[:2], 1), bool)
                     kept[index] = extent if masks is None else masks[level]
                     value = bounded(value, level)
+            case Relu() if node.source in joined:
+                before: Any = nodes[node.source]
+                mask = None if masks is None else masks[level]
+                value = convolve_rectified(params[before.layer], *read(before), mask, precision)
+                kept[index] = value > 0
             case Relu():
                 passes = values[node.source] > 0
                 if masks is not None:
@@ -297,6 +316,22 @@ def evaluate_part(
                 value = kept[index].result
         values[index] = value
     return values, kept
+
+
+def _rectified(nodes: Sequence[Node], which: range) -> dict[int, Any]:
+    """Of these nodes, convolutions that a ReLU of these reads and nothing else."""
+    readers: dict[int, list[int]] = {}
+    for index, node in enumerate(nodes):
+        for source in sources(node):
+            readers.setdefault(source, []).append(index)
+    return {
+        i: nodes[i]
+        for i in which
+        if isinstance(nodes[i], Conv)
+        and len(by := readers.get(i, [])) == 1
+        and by[0] in which
+        and isinstance(nodes[by[0]], Relu)
+    }
 
 
 def _not_bounded(nodes: Sequence[Node]) -> set[int]:

@@ -8,7 +8,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from progden_jax import _amx
+from progden_jax._amx_convolution import convolution
 from progden_jax._convolution import same_convolution, upsampled_convolution
+from progden_jax._upsampling import folded
 from progden_jax.denoisers.nodes import BATCH, BATCH_EPSILON
 
 
@@ -29,24 +32,45 @@ class Weighted(NamedTuple):
 
 def convolve(layer: Any, x: Array, precision: Any) -> Array:
     kernel = jnp.asarray(layer["kernel"])
-    if precision == "bfloat16":
-        value = lax.conv_general_dilated(
-            x[None].astype(jnp.bfloat16),
-            kernel.astype(jnp.bfloat16),
-            (1, 1),
-            "SAME",
-            dimension_numbers=("NHWC", "HWIO", "NHWC"),
-            preferred_element_type=x.dtype,
-        )[0]
-    else:
-        value = same_convolution(x[None], kernel, precision)[0]
+    value = same_convolution(x[None], kernel, precision)[0]
     return value + layer["bias"] if "bias" in layer else value
 
 
 def folds(layer: Any, precision: Any) -> bool:
     """Where the upsampling joins the convolution that reads it. Untried on GPUs."""
     square = jnp.shape(layer["kernel"])[:2] == (3, 3)
-    return square and precision != "bfloat16" and jax.default_backend() == "cpu"
+    float32 = precision != "bfloat16" or _amx.planes(precision, layer["kernel"]) > 0
+    return square and float32 and jax.default_backend() == "cpu"
+
+
+def rectifies(layer: Any, precision: Any, like: Array) -> bool:
+    """Where a convolution of such values takes its bias and ReLU along."""
+    return _amx.planes(precision, layer["kernel"], layer.get("bias", layer["kernel"]), like) > 0
+
+
+def convolve_rectified(
+    layer: Any,
+    low: Array | None,
+    others: Sequence[Array],
+    inside: Array | None,
+    precision: Any,
+) -> Array:
+    """A convolution of `low`, upsampled, beside the others, and the ReLU that follows it."""
+    kernel = jnp.asarray(layer["kernel"])
+    coarse, split = (None, None), 0
+    if low is not None:
+        split = low.shape[-1]
+        coarse = low[None], folded(kernel[:, :, :split])
+    image = jnp.concatenate(others, axis=-1)[None] if others else None
+    return convolution(
+        *coarse,
+        image,
+        None if image is None else kernel[:, :, split:],
+        planes=_amx.planes(precision, kernel),
+        bias=layer.get("bias"),
+        inside=None if inside is None else inside[None, :, :, 0].astype(jnp.uint8),
+        relu=True,
+    )[0]
 
 
 def convolve_upsampled(layer: Any, low: Array, others: Sequence[Array], precision: Any) -> Array:

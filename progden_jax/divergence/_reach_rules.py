@@ -143,6 +143,20 @@ def _convolve(equation: Any, index: int, axis: int) -> Reads:
     )
 
 
+def _convolve_by_amx(equation: Any, index: int, axis: int) -> Reads:
+    """Of `_amx_convolution.convolution`: of half the size the first operand, of the output's the third."""
+    if axis == 0:
+        return _same(0, _shape(equation, index)[0])
+    if axis == 3:
+        return None
+    out = np.arange(_out_shape(equation)[axis])
+    if index == 0:
+        first = out // 2 + out % 2 - 1
+        return axis, first, first + 2
+    size = _shape(equation, 3)[axis - 1]
+    return axis, *_window(len(out), size, 1, size // 2, 1, 1)
+
+
 def _dot(equation: Any, index: int, axis: int) -> Reads:
     contracted, batch = equation.params["dimension_numbers"]
     shape = _shape(equation, index)
@@ -216,6 +230,7 @@ RULES = {
     "reduce_window_sum": Rule(_reduce_window),
     "select_and_gather_add": Rule(_reduce_window),
     "conv_general_dilated": Rule(_convolve),
+    "amx_convolution": Rule(_convolve_by_amx, (0, 2)),
     "dot_general": Rule(_dot, (0, 1)),
     "concatenate": Rule(_concatenate, None),
     "stack": Rule(_stack, None),

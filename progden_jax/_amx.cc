@@ -1,0 +1,431 @@
+// Convolutions by the matrix units of x86 CPUs (AMX), for XLA's foreign function interface.
+//
+// These multiply 16x32 by 32x16 bfloat16 and sum in float32. A float32 is the sum of three bfloat16, and of
+// the nine products of two such sums six matter: with those the result is as good as of float32 products.
+//
+// An image's pixels are rows of a matrix as they lie in memory: a row of taps, kw * c values one after
+// another, begins c values after its neighbour's. So nothing is gathered but what is rounded, patch by patch.
+
+#include <immintrin.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <atomic>
+#include <condition_variable>
+#include <cstdint>
+#include <cstdlib>
+#include <cstring>
+#include <functional>
+#include <memory>
+#include <mutex>
+#include <new>
+#include <vector>
+
+#include "xla/ffi/api/ffi.h"
+
+namespace ffi = xla::ffi;
+
+namespace {
+
+using Half = uint16_t;  // bfloat16
+
+constexpr int64_t kTile = 16;       // rows of a tile, and float32 in one of its rows
+constexpr int64_t kDepth = 32;      // bfloat16 in one of its rows
+constexpr int64_t kHalves = 512;    // bfloat16 in a tile
+constexpr int64_t kPixels = 32;     // of a block, by as many outputs: four tiles of sums
+constexpr int64_t kPatch = 1 << 20; // bytes that a task's input may take, of a second-level cache's 2 MiB
+
+struct Free {
+  void operator()(void* memory) const { std::free(memory); }
+};
+
+struct Memory {
+  std::unique_ptr<char, Free> data;
+  int64_t size = 0;
+
+  template <typename T>
+  T* reserve(int64_t count) {
+    const int64_t bytes = (count * sizeof(T) + 63) / 64 * 64;
+    if (bytes > size) {
+      data.reset(static_cast<char*>(std::aligned_alloc(64, bytes)));
+      if (!data) throw std::bad_alloc();
+      size = bytes;
+    }
+    return reinterpret_cast<T*>(data.get());
+  }
+};
+
+struct alignas(64) Palette {
+  uint8_t id = 1, start = 0, rest[14] = {};
+  uint16_t bytes[16] = {64, 64, 64, 64, 64, 64, 64, 64};
+  uint8_t rows[16] = {16, 16, 16, 16, 16, 16, 16, 16};
+};
+
+inline __mmask16 first(int64_t count) { return count >= 16 ? 0xffff : (1u << std::max<int64_t>(count, 0)) - 1; }
+
+inline __m512 widened(__m256i halves) {
+  return _mm512_castsi512_ps(_mm512_slli_epi32(_mm512_cvtepu16_epi32(halves), 16));
+}
+
+// What rounding left of x; of infinities nothing.
+inline __m512 rest(__m512 x, __m512 rounded) {
+  return _mm512_maskz_sub_ps(_mm512_cmp_ps_mask(x, rounded, _CMP_NEQ_OQ), x, rounded);
+}
+
+template <int P>
+inline void split(__m512 x, __m256i (&parts)[P]) {
+  for (int p = 0; p < P; ++p) {
+    parts[p] = (__m256i)_mm512_cvtneps_pbh(x);
+    if (p + 1 < P) x = rest(x, widened(parts[p]));
+  }
+}
+
+struct Source {
+  const float* image;   // n, h, w, c
+  int64_t h, w, c;
+  const float* kernel;  // kh, kw, c, outputs
+  int64_t kh, kw;
+  // At half the output's size, with the four pixels over each cell of it as outputs: a 2x2 kernel whose
+  // window begins one row and column before the cell for those above and left, at the cell for the others.
+  bool corners;
+  Memory memory;
+  Half* packed = nullptr;  // [parity][16 outputs][row of taps][step][plane] tiles
+  int64_t steps = 0;       // of a row of taps
+};
+
+struct Job {
+  std::vector<Source> sources;
+  const float* bias = nullptr;      // outputs
+  const uint8_t* gate = nullptr;    // n, H / bits, W, outputs: where values pass, a bit for each of `bits` rows
+  const uint8_t* inside = nullptr;  // images, H, W: zero elsewhere
+  int64_t bits = 1, images = 1;
+  bool relu = false;
+  float* out = nullptr;             // n, H, W, outputs
+  int64_t n, H, W, outputs;
+  int64_t step = 1;                 // 2 where a source has corners: even and odd pixels have taps of their own
+  int64_t rows = 0, columns = 0;    // of a task, in cells of step by step pixels
+
+  int64_t tiles() const { return (outputs + kTile - 1) / kTile; }
+};
+
+struct Patch {
+  Half* data;
+  int64_t y, x, row, plane;  // where it begins; halves from row to row and plane to plane
+};
+
+template <int P>
+void pack(const Job& job, Source& s) {
+  const int64_t parities = s.corners ? 4 : 1, depth = s.kw * s.c, stride = parities * job.outputs;
+  s.steps = (depth + kDepth - 1) / kDepth;
+  s.packed = s.memory.reserve<Half>(parities * job.tiles() * s.kh * s.steps * P * kHalves);
+  Half* to = s.packed;
+  for (int64_t q = 0; q < parities; ++q)
+    for (int64_t t = 0; t < job.tiles(); ++t)
+      for (int64_t y = 0; y < s.kh; ++y)
+        for (int64_t step = 0; step < s.steps; ++step, to += P * kHalves)
+          for (int64_t pair = 0; pair < kTile; ++pair) {
+            const __mmask16 mask = first(job.outputs - t * kTile);
+            const int64_t k = step * kDepth + 2 * pair;
+            const float* from = s.kernel + (y * depth + k) * stride + q * job.outputs + t * kTile;
+            __m256i even[P], odd[P];
+            split<P>(_mm512_maskz_loadu_ps(k < depth ? mask : 0, from), even);
+            split<P>(_mm512_maskz_loadu_ps(k + 1 < depth ? mask : 0, from + stride), odd);
+            for (int p = 0; p < P; ++p) {
+              const __m512i high = _mm512_slli_epi32(_mm512_cvtepu16_epi32(odd[p]), 16);
+              _mm512_store_si512(to + p * kHalves + pair * kDepth,
+                                 _mm512_or_si512(high, _mm512_cvtepu16_epi32(even[p])));
+            }
+          }
+}
+
+// Pixels from (patch.y, patch.x), zeros beyond the image, as P bfloat16 each.
+template <int P>
+void gather(const Source& s, int64_t image, int64_t rows, int64_t columns, Memory& memory, Patch& patch) {
+  patch.row = columns * s.c;
+  // A block may reach beyond the last pixel: what it finds there is not kept, but must be there to be read.
+  const int64_t beyond = (2 * kPixels + s.kw) * s.c + 2 * kDepth;
+  patch.plane = (rows * patch.row + beyond + kDepth - 1) / kDepth * kDepth;
+  patch.data = memory.reserve<Half>(P * patch.plane);
+  const int64_t left = std::clamp<int64_t>(-patch.x, 0, columns) * s.c;
+  const int64_t right = std::max(std::clamp<int64_t>(s.w - patch.x, 0, columns) * s.c, left);
+  for (int p = 0; p < P; ++p)
+    std::memset(patch.data + p * patch.plane + rows * patch.row, 0,
+                (patch.plane - rows * patch.row) * sizeof(Half));
+  for (int64_t r = 0; r < rows; ++r) {
+    const int64_t y = patch.y + r;
+    const bool there = y >= 0 && y < s.h;
+    const int64_t begin = there ? left : 0, end = there ? right : 0;
+    Half* to = patch.data + r * patch.row;
+    for (int p = 0; p < P; ++p) {
+      std::memset(to + p * patch.plane, 0, begin * sizeof(Half));
+      std::memset(to + p * patch.plane + end, 0, (patch.row - end) * sizeof(Half));
+    }
+    const float* from = s.image + ((image * s.h + y) * s.w + patch.x) * s.c;
+    int64_t k = begin;
+    for (; k + 2 * kTile <= end; k += 2 * kTile) {
+      __m512 low = _mm512_loadu_ps(from + k), high = _mm512_loadu_ps(from + k + kTile);
+      for (int p = 0; p < P; ++p) {
+        const __m512i both = (__m512i)_mm512_cvtne2ps_pbh(high, low);
+        _mm512_storeu_si512(to + p * patch.plane + k, both);
+        if (p + 1 < P) {
+          low = rest(low, widened(_mm512_castsi512_si256(both)));
+          high = rest(high, widened(_mm512_extracti64x4_epi64(both, 1)));
+        }
+      }
+    }
+    for (; k < end; k += kTile) {
+      __m256i parts[P];
+      split<P>(_mm512_maskz_loadu_ps(first(end - k), from + k), parts);
+      for (int p = 0; p < P; ++p)
+        _mm256_mask_storeu_epi16(to + p * patch.plane + k, first(end - k), parts[p]);
+    }
+  }
+}
+
+// M by N tiles of sums: 0 to 3. Of pixels 4 and 5, of kernels 6 and 7.
+template <int M>
+inline void load_pixels(const Half* from, int64_t stride) {
+  _tile_loadd(4, from, stride * sizeof(Half));
+  if (M > 1) _tile_loadd(5, from + kTile * stride, stride * sizeof(Half));
+}
+
+template <int N>
+inline void load_kernels(const Half* from, int64_t next) {
+  _tile_loadd(6, from, 64);
+  if (N > 1) _tile_loadd(7, from + next, 64);
+}
+
+template <int M, int N>
+inline void multiply() {
+  _tile_dpbf16ps(0, 4, 6);
+  if (N > 1) _tile_dpbf16ps(1, 4, 7);
+  if (M > 1) _tile_dpbf16ps(2, 5, 6);
+  if (M > 1 && N > 1) _tile_dpbf16ps(3, 5, 7);
+}
+
+// Small products first.
+template <int P, int M, int N>
+inline void add_taps(const Source& s, const Half* pixels, int64_t stride, const Patch& patch, const Half* kernels,
+                     int64_t next) {
+  for (int64_t y = 0; y < s.kh; ++y, pixels += patch.row)
+    for (int64_t k = 0; k < s.steps; ++k, kernels += P * kHalves) {
+      const Half* at = pixels + k * kDepth;
+      if (P == 3) {
+        load_pixels<M>(at + 2 * patch.plane, stride);
+        load_kernels<N>(kernels, next);
+        multiply<M, N>();
+      }
+      if (P >= 2) {
+        load_pixels<M>(at + patch.plane, stride);
+        if (P == 2) load_kernels<N>(kernels, next);
+        multiply<M, N>();
+        load_kernels<N>(kernels + kHalves, next);
+        if (P == 3) multiply<M, N>();
+      }
+      load_pixels<M>(at, stride);
+      if (P >= 2) multiply<M, N>();
+      if (P == 3) {
+        load_kernels<N>(kernels + 2 * kHalves, next);
+        multiply<M, N>();
+      }
+      load_kernels<N>(kernels, next);
+      multiply<M, N>();
+    }
+}
+
+struct Place {
+  int64_t image, i, j, y, x, t;  // i, j: parity; y, x: cell; t: first tile of outputs
+};
+
+template <int P, int M, int N>
+void add_block(const Job& job, const Patch* patches, const Place& at, float* sums) {
+  _tile_zero(0);
+  if (N > 1) _tile_zero(1);
+  if (M > 1) _tile_zero(2);
+  if (M > 1 && N > 1) _tile_zero(3);
+  for (size_t n = 0; n < job.sources.size(); ++n) {
+    const Source& s = job.sources[n];
+    const Patch& patch = patches[n];
+    const int64_t next = s.kh * s.steps * P * kHalves;
+    const int64_t parity = s.corners ? 2 * at.i + at.j : 0;
+    const int64_t y = s.corners ? at.y + at.i - 1 : at.y * job.step + at.i - s.kh / 2;
+    const int64_t x = s.corners ? at.x + at.j - 1 : at.x * job.step + at.j - s.kw / 2;
+    const Half* pixels = patch.data + (y - patch.y) * patch.row + (x - patch.x) * s.c;
+    add_taps<P, M, N>(s, pixels, s.corners ? s.c : job.step * s.c, patch,
+                      s.packed + (parity * job.tiles() + at.t) * next, next);
+  }
+  constexpr int64_t kRow = 2 * kTile;
+  _tile_stored(0, sums, kRow * sizeof(float));
+  if (N > 1) _tile_stored(1, sums + kTile, kRow * sizeof(float));
+  if (M > 1) _tile_stored(2, sums + kTile * kRow, kRow * sizeof(float));
+  if (M > 1 && N > 1) _tile_stored(3, sums + kTile * kRow + kTile, kRow * sizeof(float));
+}
+
+// Sums of a block to the output, through bias, ReLU, gate and bounds.
+void finish(const Job& job, const Place& at, int64_t pixels, const float* sums) {
+  const int64_t y = at.y * job.step + at.i, x = at.x * job.step + at.j, output = at.t * kTile;
+  const int64_t pixel = (at.image * job.H + y) * job.W + x;
+  const uint8_t* inside =
+      job.inside ? job.inside + ((job.images > 1 ? at.image : 0) * job.H + y) * job.W + x : nullptr;
+  const uint8_t* gate = nullptr;
+  if (job.gate)
+    gate = job.gate + ((at.image * (job.H / job.bits) + y / job.bits) * job.W + x) * job.outputs + output;
+  const __m128i bit = _mm_set1_epi8(static_cast<char>(1 << y % job.bits));
+  const __m512 zero = _mm512_setzero_ps();
+  for (int64_t half = 0; half < 2; ++half) {
+    const __mmask16 wanted = first(job.outputs - output - half * kTile);
+    if (!wanted) break;
+    const __m512 bias = job.bias ? _mm512_maskz_loadu_ps(wanted, job.bias + output + half * kTile) : zero;
+    float* out = job.out + pixel * job.outputs + output + half * kTile;
+    for (int64_t p = 0; p < pixels; ++p, out += job.step * job.outputs) {
+      __mmask16 passes = inside && !inside[p * job.step] ? 0 : 0xffff;
+      __m512 value = _mm512_add_ps(_mm512_load_ps(sums + p * 2 * kTile + half * kTile), bias);
+      // As a comparison with 0, so that NaN does not pass either.
+      if (job.relu) passes &= _mm512_cmp_ps_mask(value, zero, _CMP_GT_OQ);
+      if (gate) {
+        const uint8_t* of = gate + p * job.step * job.outputs + half * kTile;
+        passes &= _mm_test_epi8_mask(_mm_maskz_loadu_epi8(wanted, of), bit);
+      }
+      _mm512_mask_storeu_ps(out, wanted, _mm512_maskz_mov_ps(passes, value));
+    }
+  }
+}
+
+template <int P>
+void task(const Job& job, int64_t index) {
+  thread_local Memory memory[2];
+  const int64_t h = job.H / job.step, w = job.W / job.step;
+  const int64_t across = (w + job.columns - 1) / job.columns, down = (h + job.rows - 1) / job.rows;
+  Place at;
+  at.image = index / (across * down);
+  const int64_t y0 = index / across % down * job.rows, x0 = index % across * job.columns;
+  const int64_t y1 = std::min(h, y0 + job.rows), x1 = std::min(w, x0 + job.columns);
+  const Palette palette;
+  _tile_loadconfig(&palette);
+  Patch patches[2];
+  for (size_t n = 0; n < job.sources.size(); ++n) {
+    const Source& s = job.sources[n];
+    const int64_t per = s.corners ? 1 : job.step, edge = s.corners ? 0 : 1;
+    patches[n].y = y0 * per - s.kh / 2;
+    patches[n].x = x0 * per - s.kw / 2;
+    gather<P>(s, at.image, (y1 - y0) * per + s.kh - edge, (x1 - x0) * per + s.kw - edge, memory[n], patches[n]);
+  }
+  alignas(64) float sums[4 * kTile * kTile];
+  for (at.i = 0; at.i < job.step; ++at.i)
+    for (at.j = 0; at.j < job.step; ++at.j)
+      for (at.t = 0; at.t < job.tiles(); at.t += 2)
+        for (at.y = y0; at.y < y1; ++at.y)
+          for (at.x = x0; at.x < x1; at.x += kPixels) {
+            const int64_t pixels = std::min(kPixels, x1 - at.x);
+            const bool one = pixels <= kTile, last = job.tiles() - at.t == 1;
+            (one ? last ? add_block<P, 1, 1> : add_block<P, 1, 2>
+                 : last ? add_block<P, 2, 1> : add_block<P, 2, 2>)(job, patches, at, sums);
+            finish(job, at, pixels, sums);
+          }
+  _tile_release();
+}
+
+// Of so many tasks, those that nobody began. Whoever waits works, so that a full pool cannot stop it.
+struct Tasks {
+  std::function<void(int64_t)> run;
+  int64_t count, done = 0;
+  std::atomic<int64_t> next{0};
+  std::mutex mutex;
+  std::condition_variable all;
+
+  void work() {
+    int64_t mine = 0;
+    for (int64_t i; (i = next.fetch_add(1)) < count; ++mine) run(i);
+    if (!mine) return;
+    std::lock_guard<std::mutex> lock(mutex);
+    done += mine;
+    if (done == count) all.notify_one();
+  }
+};
+
+void in_parallel(ffi::ThreadPool& pool, int64_t count, std::function<void(int64_t)> run) {
+  auto tasks = std::make_shared<Tasks>();
+  tasks->run = std::move(run);
+  tasks->count = count;
+  const int64_t helpers = std::min<int64_t>(pool.num_threads(), count) - 1;
+  for (int64_t i = 0; i < helpers; ++i) pool.Schedule([tasks] { tasks->work(); });
+  tasks->work();
+  std::unique_lock<std::mutex> lock(tasks->mutex);
+  tasks->all.wait(lock, [&] { return tasks->done == tasks->count; });
+}
+
+template <int P>
+void run(Job& job, ffi::ThreadPool& pool) {
+  for (Source& s : job.sources) pack<P>(job, s);
+  job.rows = kTile / job.step;
+  job.columns = 4 * kPixels;
+  auto bytes = [&] {
+    int64_t total = 0;
+    for (const Source& s : job.sources) {
+      const int64_t per = s.corners ? 1 : job.step;
+      total += (job.rows * per + s.kh) * (job.columns * per + s.kw) * s.c * P * sizeof(Half);
+    }
+    return total;
+  };
+  while (job.columns > kPixels && bytes() > kPatch) job.columns /= 2;
+  while (job.rows > 1 && bytes() > kPatch) job.rows /= 2;
+  const int64_t h = job.H / job.step, w = job.W / job.step;
+  const int64_t count = job.n * ((h + job.rows - 1) / job.rows) * ((w + job.columns - 1) / job.columns);
+  in_parallel(pool, count, [&job](int64_t index) { task<P>(job, index); });
+}
+
+using Floats = ffi::Buffer<ffi::F32>;
+using Bytes = ffi::Buffer<ffi::U8>;
+
+// Absent parts have no elements. low: n, H/2, W/2, c and its kernel 2, 2, c, 4 * outputs in the order of
+// parities; image: n, H, W, c and its kernel kh, kw, c, outputs.
+ffi::Error convolve(ffi::ThreadPool pool, Floats low, Floats low_kernel, Floats image, Floats kernel, Floats bias,
+                    Bytes gate, Bytes inside, ffi::ResultBuffer<ffi::F32> out, int64_t planes, int64_t bits,
+                    bool relu) try {
+  Job job;
+  const auto o = out->dimensions();
+  job.n = o[0], job.H = o[1], job.W = o[2], job.outputs = o[3];
+  job.out = out->typed_data();
+  auto add = [&](const Floats& of, const Floats& by, bool corners) {
+    if (!of.element_count()) return;
+    const auto d = of.dimensions(), k = by.dimensions();
+    Source s{of.typed_data(), d[1], d[2], d[3], by.typed_data(), k[0], k[1], corners};
+    job.sources.push_back(std::move(s));
+  };
+  add(low, low_kernel, true);
+  if (!job.sources.empty()) job.step = 2;
+  add(image, kernel, false);
+  if (bias.element_count()) job.bias = bias.typed_data();
+  if (gate.element_count()) job.gate = gate.typed_data();
+  if (inside.element_count()) job.inside = inside.typed_data(), job.images = inside.dimensions()[0];
+  job.bits = bits, job.relu = relu;
+  if (!out->element_count()) return ffi::Error::Success();
+  planes == 1 ? run<1>(job, pool) : planes == 2 ? run<2>(job, pool) : run<3>(job, pool);
+  return ffi::Error::Success();
+} catch (const std::exception& error) {
+  return ffi::Error(ffi::ErrorCode::kResourceExhausted, error.what());
+}
+
+}  // namespace
+
+XLA_FFI_DEFINE_HANDLER_SYMBOL(progden_convolve, convolve,
+                              ffi::Ffi::Bind()
+                                  .Ctx<ffi::ThreadPool>()
+                                  .Arg<Floats>()
+                                  .Arg<Floats>()
+                                  .Arg<Floats>()
+                                  .Arg<Floats>()
+                                  .Arg<Floats>()
+                                  .Arg<Bytes>()
+                                  .Arg<Bytes>()
+                                  .Ret<Floats>()
+                                  .Attr<int64_t>("planes")
+                                  .Attr<int64_t>("bits")
+                                  .Attr<bool>("relu"));
+
+// Whether the system lets this process use AMX: Linux gives its registers to those that ask.
+extern "C" int progden_asks_for_amx() {
+  constexpr long kAskFor = 0x1023, kTileData = 18;
+  return syscall(SYS_arch_prctl, kAskFor, kTileData) == 0;
+}

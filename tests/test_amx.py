@@ -1,0 +1,278 @@
+"""Convolutions by matrix units against dense sums in float64, and what is said where there are none."""
+
+import itertools
+import os
+import shutil
+import stat
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from progden_jax import _amx, _amx_convolution, denoisers
+from progden_jax._convolution import same_convolution, upsampled_convolution
+from progden_jax._slopes import packed, unpacked
+from progden_jax.denoisers import _network, layers
+from progden_jax.divergence._reach import radii
+
+needs_amx = pytest.mark.skipif(_amx.status() is not None, reason=f"AMX: {_amx.status()}")
+
+
+def dense(image, kernel):
+    """Every tap's product in float64, zeros around."""
+    kh, kw = kernel.shape[:2]
+    border = ((0, 0), (kh // 2,) * 2, (kw // 2,) * 2, (0, 0))
+    padded, kernel = np.pad(np.asarray(image, np.float64), border), np.asarray(kernel, np.float64)
+    h, w = image.shape[1:3]
+    taps = itertools.product(range(kh), range(kw))
+    return sum(padded[:, i : i + h, j : j + w] @ kernel[i, j] for i, j in taps)
+
+
+def repeated(low):
+    return np.repeat(np.repeat(np.asarray(low), 2, axis=1), 2, axis=2)
+
+
+def drawn(rng, *shape):
+    return jnp.asarray(rng.normal(size=shape), jnp.float32)
+
+
+def off(found, expected):
+    return np.sqrt(np.mean((np.asarray(found, np.float64) - expected) ** 2) / np.mean(expected**2))
+
+
+@needs_amx
+@pytest.mark.parametrize(
+    ("size", "channels", "outputs", "edge"),
+    [
+        ((1, 1), 64, 32, 3),
+        ((5, 17), 9, 33, 3),
+        ((3, 33), 13, 3, 5),
+        ((18, 131), 48, 80, 3),
+        ((2, 40), 7, 16, 7),
+        ((33, 16), 1, 64, 3),
+        ((4, 200), 700, 5, 1),
+    ],
+    ids=str,
+)
+def test_convolution(size, channels, outputs, edge):
+    """Sizes and channels that fill no tile; of a patch larger than its share of the cache."""
+    rng = np.random.default_rng(0)
+    image = drawn(rng, 2, *size, channels)
+    kernel = drawn(rng, edge, edge, channels, outputs)
+    expected = dense(image, kernel)
+    for planes, bound in ((1, 1e-2), (2, 2e-5), (3, 5e-7)):
+        found = _amx_convolution.convolution(None, None, image, kernel, planes=planes)
+        assert off(found, expected) < bound
+    assert off(found, expected) < 2 * off(plain(image, kernel), expected)
+
+
+def plain(image, kernel):
+    return lax.conv_general_dilated(
+        *(image, kernel, (1, 1), "SAME"),
+        dimension_numbers=("NHWC", "HWIO", "NHWC"),
+        precision="highest",
+    )
+
+
+@needs_amx
+@pytest.mark.parametrize("skip", [0, 9])
+def test_of_pixels_that_are_repeated(skip):
+    rng = np.random.default_rng(1)
+    low, image = drawn(rng, 2, 9, 35, 20), drawn(rng, 2, 18, 70, skip)
+    kernel = drawn(rng, 3, 3, 20 + skip, 37)
+    expected = dense(np.concatenate([repeated(low), image], -1), kernel)
+    assert off(upsampled_convolution(low, image, kernel, "highest"), expected) < 5e-7
+    assert 1e-7 < off(upsampled_convolution(low, image, kernel, "high"), expected) < 2e-5
+    assert 1e-4 < off(upsampled_convolution(low, image, kernel, "bfloat16"), expected) < 1e-2
+
+
+@needs_amx
+@pytest.mark.parametrize("rows", [16, 12, 10, 7])
+def test_bias_relu_gate_and_bounds(rows):
+    """A bit of the gate for each of 8, 4, 2 or 1 rows."""
+    rng = np.random.default_rng(2)
+    image, kernel, bias = drawn(rng, 2, rows, 37, 16), drawn(rng, 3, 3, 16, 35), drawn(rng, 35)
+    bits = {16: 8, 12: 4, 10: 2, 7: 1}[rows]
+    passes = rng.random((2, rows, 37, 35)) < 0.5
+    inside = np.arange(rows * 37).reshape(1, rows, 37) % 37 < 30
+    gate = packed(jnp.asarray(passes), bits)
+    np.testing.assert_array_equal(unpacked(gate, bits), passes)
+    summed = np.asarray(_amx_convolution.convolution(None, None, image, kernel, planes=3)) + bias
+    for settings, expected in (
+        ({}, summed),
+        ({"relu": True}, np.maximum(summed, 0)),
+        ({"gate": gate, "bits": bits}, np.where(passes, summed, 0)),
+        ({"inside": jnp.asarray(inside, jnp.uint8)}, np.where(inside[..., None], summed, 0)),
+    ):
+        found = _amx_convolution.convolution(
+            None, None, image, kernel, planes=3, bias=bias, **settings
+        )
+        np.testing.assert_array_equal(found, expected)
+
+
+@needs_amx
+def test_a_part_is_the_same_bits():
+    """What a pixel gets hangs neither on where it lies nor on the size of the image."""
+    rng = np.random.default_rng(3)
+    image, kernel = drawn(rng, 1, 60, 150, 24), drawn(rng, 3, 3, 24, 40)
+    whole = same_convolution(image, kernel, "highest")
+    part = same_convolution(image[:, 7:41, 50:120], kernel, "highest")
+    np.testing.assert_array_equal(part[:, 1:-1, 1:-1], whole[:, 8:40, 51:119])
+
+
+def layer_and_images(rng):
+    layer = {"kernel": drawn(rng, 3, 3, 12 + 5, 20) / 5, "bias": drawn(rng, 20)}
+    return layer, drawn(rng, 3, 4, 12), drawn(rng, 6, 8, 5), jnp.arange(48).reshape(6, 8, 1) % 8 < 7
+
+
+@needs_amx
+@pytest.mark.parametrize("upsampled", [False, True])
+def test_derivatives_of_a_rectified_convolution(upsampled):
+    """Forward, reverse, second and of what was linearised, by everything, and in batches."""
+    layer, low, image, inside = layer_and_images(np.random.default_rng(4))
+
+    def joined(layer, low, image):
+        if upsampled:
+            return layers.convolve_rectified(layer, low, [image], inside, "highest")
+        wide = jnp.repeat(jnp.repeat(low, 2, 0), 2, 1)
+        return layers.convolve_rectified(layer, None, [wide, image], inside, "highest")
+
+    def by_xla(layer, low, image):
+        both = jnp.concatenate([jnp.repeat(jnp.repeat(low, 2, 0), 2, 1), image], -1)
+        value = plain(both[None], layer["kernel"])[0] + layer["bias"]
+        return jnp.where(inside, jax.nn.relu(value), 0)
+
+    def everything(f):
+        def total(*given):
+            return (jnp.sin(f(*given)) ** 2).sum()
+
+        def along(*given):
+            return jax.jvp(total, given, given)[1]
+
+        def linearised(*given):
+            tangent = jax.linearize(lambda low, image: f(given[0], low, image), *given[1:])[1]
+            return (tangent(*given[1:]) ** 2).sum()
+
+        def batches(layer, low, image):
+            more = jnp.stack([low, -low]), jnp.stack([image, 2 * image])
+            layers = jax.tree.map(lambda a: jnp.stack([a, 2 * a]), layer)
+            return (
+                jax.vmap(f, (None, 0, 0))(layer, *more),
+                jax.vmap(f, (None, None, 0))(layer, low, more[1]),
+                jax.vmap(f)(layers, *more),
+            )
+
+        every = (0, 1, 2)
+        return jax.jit(
+            lambda *given: (
+                *(jax.grad(g, every)(*given) for g in (total, along, linearised)),
+                along(*given),
+                jax.jvp(lambda low: f(given[0], low, given[2]), (low,), (low,)),
+                jax.jvp(lambda image: f(*given[:2], image), (image,), (image,)),
+                batches(*given),
+            )
+        )(layer, low, image)
+
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3),
+        everything(joined),
+        everything(by_xla),
+    )
+
+
+@needs_amx
+def test_reach(monkeypatch):
+    """What convolutions by matrix units read is known exactly."""
+    rng = np.random.default_rng(5)
+    kernel, other = drawn(rng, 5, 5, 4, 16), drawn(rng, 3, 3, 20, 16)
+
+    def f(x):
+        x = jnp.pad(x, ((0, 0), (0, 0), (0, 1)))[None]
+        low = same_convolution(x[:, ::2, ::2], kernel)
+        return upsampled_convolution(low, x, other)[0, :, :, :3]
+
+    # An even row reads the row of cells before its own, and that two more: six rows of the image.
+    assert radii(f, jnp.zeros((64, 64, 3))) == (6, 6)
+    monkeypatch.setattr(_amx, "available", lambda: False)
+    assert min(radii(lambda x: f(x), jnp.zeros((64, 64, 3)))) >= 6
+
+
+@needs_amx
+def test_networks_agree_with_xla(real_frame, monkeypatch):
+    frame = jax.tree.map(lambda a: jnp.asarray(a[40:76, 30:70]) if a.ndim else a, real_frame)
+    f, x = denoisers.load("oidn-hdr-small").bind(frame), jnp.asarray(frame.color)
+    found = []
+    for by_amx in (True, False):
+        if not by_amx:
+            monkeypatch.setattr(_amx, "available", lambda: False)
+        _network._run_bound.clear_cache()
+        found.append(jax.jvp(f, (x,), (x,)))
+    _network._run_bound.clear_cache()
+    for a, b in zip(*found, strict=True):
+        assert 0 < off(a, np.asarray(b, np.float64)) < 5e-6
+
+
+@pytest.fixture
+def fresh():
+    """As in a process that has not asked yet."""
+    _amx.status.cache_clear()
+    yield
+    _amx.status.cache_clear()
+
+
+def test_switched_off(fresh, monkeypatch):
+    monkeypatch.setenv("PROGDEN_AMX", "0")
+    assert _amx.status() == "switched off by PROGDEN_AMX"
+    assert not _amx.available()
+    assert _amx.planes("highest", jnp.zeros((3, 3, 32, 32))) == 0
+
+
+def test_a_cpu_without_it(fresh, monkeypatch):
+    monkeypatch.setattr(_amx, "_cpu_flags", lambda: {"sse", "avx512bw"})
+    assert "the CPU has no amx_bf16, amx_tile" in str(_amx.status())
+
+
+@pytest.fixture
+def on_any_cpu(fresh, monkeypatch, tmp_path):
+    monkeypatch.setattr(_amx, "_cpu_flags", lambda: _amx._NEEDED)
+    monkeypatch.setenv("PROGDEN_CACHE", str(tmp_path / "cache"))
+    return tmp_path
+
+
+def test_no_compiler(on_any_cpu, monkeypatch):
+    monkeypatch.delenv("CXX", raising=False)
+    monkeypatch.setenv("PATH", str(on_any_cpu))
+    assert "there is no C++ compiler" in str(_amx.status())
+
+
+def test_a_compiler_that_fails(on_any_cpu, monkeypatch):
+    """Its last words are said, and nothing half made stays."""
+    compiler = on_any_cpu / "broken"
+    script = '#!/bin/sh\n[ "$1" = --version ] && exit 0\necho "no such flag" >&2\nexit 1\n'
+    compiler.write_text(script)
+    compiler.chmod(compiler.stat().st_mode | stat.S_IXUSR)
+    monkeypatch.setenv("CXX", str(compiler))
+    assert "could not compile _amx.cc: no such flag" in str(_amx.status())
+    assert os.listdir(on_any_cpu / "cache") == []
+
+
+@needs_amx
+def test_it_is_compiled_once(on_any_cpu, monkeypatch):
+    made = _amx._library()
+    assert list((on_any_cpu / "cache").iterdir()) == [made]
+    monkeypatch.setattr(_amx, "_compiled", None)
+    assert _amx._library() == made
+
+
+@needs_amx
+def test_a_cache_that_cannot_be_written(on_any_cpu, monkeypatch):
+    def refuse(*_, **__):
+        raise PermissionError
+
+    monkeypatch.setattr(_amx.tempfile, "TemporaryDirectory", refuse)
+    made = _amx._library()
+    assert made.is_file()
+    assert on_any_cpu not in made.parents
+    shutil.rmtree(made.parent)
