@@ -40,7 +40,7 @@ from experiments.table2 import plot as table2
 from experiments.table3 import plot as table3
 from experiments.table4 import plot as table4
 from experiments.table4 import train as table4_train
-from progden_jax import denoisers, evaluation, mixers
+from progden_jax import _amx, denoisers, evaluation, mixers
 from progden_jax.evaluation.database import Database
 from progden_jax.evaluation.settings import DEFAULT
 from progden_jax.frame import centre
@@ -536,8 +536,10 @@ def test_times_of_denoisers(command, tiny):
 
 def test_convolutions(command):
     """Every way to the convolution gives the same, Winograd's too, in bfloat16 to its digits."""
-    printed = command(convolutions, "--shapes", "8x4x4", "--repeats", 1)
-    off = {row[1]: row[5] for row in cells(printed, "8x4x4")}
+    printed = command(convolutions, "--shapes", "8x8x8", "--repeats", 1)
+    off = {row[1]: row[5] for row in cells(printed, "8x8x8")}
+    if _amx.available():
+        assert float(off["AMX, 3 bfloat16 a value"]) < 1e-6
     assert float(off["Winograd"]) < 1e-5
     assert 1e-4 < float(off["direct, bfloat16"]) < 1e-2
     assert off["product alone"] == ""
@@ -545,7 +547,9 @@ def test_convolutions(command):
 
 def test_performance(command, monkeypatch, tiny, tmp_path):
     """Without competitors: every part has a time, and the convolutions their operations."""
-    monkeypatch.setattr(performance, "convolution", lambda *_: step.convolution(1, 32, 8))
+    monkeypatch.setattr(
+        performance, "convolution", lambda *_, **how: step.convolution(1, 32, 8, **how)
+    )
     output = tmp_path / "found.csv"
     words = ("--sizes", "32x32", "--probes", 1, "--denoiser", tiny, "--rounds", 1)
     words += ("--against", "--error-size", "none", "--no-processes", "--output", output)

@@ -1,4 +1,4 @@
-"""Other ways to a 3×3 convolution on this machine, against XLA's own: Winograd's, and half precision.
+"""Other ways to a 3×3 convolution on this machine, against XLA's own: AMX, Winograd's, half precision.
 
     python -m experiments.performance.convolutions [--shapes 512x64x64 512x32x32]
 
@@ -20,6 +20,8 @@ from jaxtyping import Array, Float
 
 from experiments import _common
 from experiments.performance.step import seconds
+from progden_jax import _amx
+from progden_jax._convolution import same_convolution
 
 INPUT = (
     (4, 0, -5, 0, 1, 0),
@@ -91,6 +93,13 @@ def _combined(matrix: Sequence[Sequence[float]], values: Sequence[Array]) -> lis
     ]
 
 
+def by_amx(
+    image: Float[Array, "h w c"], kernel: Float[Array, "3 3 c k"], *, precision: str
+) -> Float[Array, "h w k"]:
+    """The library's own, of so many bfloat16 a value."""
+    return same_convolution(image[None], kernel, precision)[0]
+
+
 def as_product(columns: Float[Array, "n 9c"], kernel: Float[Array, "9c k"]) -> Float[Array, "n k"]:
     """A convolution of pixels whose neighbours are side by side already, summed in float32."""
     return lax.dot(columns, kernel, preferred_element_type=jnp.float32)
@@ -109,6 +118,18 @@ def programs(size: int, channels: int, outputs: int) -> dict[str, tuple[Callable
         **{f"direct, by {name}": (direct, (image, kernel), o) for name, o in SWITCHES.items()},
         "Winograd": (winograd, (image, transformed(kernel)), {}),
         "direct, bfloat16": (direct, half, {}),
+        **(
+            {
+                f"AMX, {_amx.planes(precision, kernel)} bfloat16 a value": (
+                    functools.partial(by_amx, precision=precision),
+                    (image, kernel),
+                    {},
+                )
+                for precision in ("highest", "high", "bfloat16")
+            }
+            if _amx.planes("highest", kernel)
+            else {}
+        ),
         "product alone": (as_product, (columns, flat), {}),
         "product alone, bfloat16": (
             as_product,

@@ -20,6 +20,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 import progden_jax as pd
 from experiments import _common
 from progden_jax import mixers
+from progden_jax._convolution import same_convolution
 from progden_jax._devices import cores_as_devices
 from progden_jax.training import MixerConfig, MixerTask, config
 from progden_jax.training.step import make_start, make_step
@@ -33,13 +34,17 @@ def operations(params: Any, pixels: int) -> float:
     return 2 * pixels * (3 * sum(products.values()) - products["conv_in"])
 
 
-def convolution(batch: int, size: int, channels: int) -> tuple[Any, tuple[Any, ...], float]:
-    """A 3×3 convolution, its arguments and its operations."""
+def convolution(
+    batch: int, size: int, channels: int, *, by_xla: bool
+) -> tuple[Any, tuple[Any, ...], float]:
+    """A 3×3 convolution in float32, its arguments and its operations: XLA's own, or the fastest at hand."""
     image = jnp.ones((batch, size, size, channels))
     kernel = jnp.full((3, 3, channels, channels), 0.01)
 
     @jax.jit
     def run(image: jax.Array, kernel: jax.Array) -> jax.Array:
+        if not by_xla:
+            return same_convolution(image, kernel, "highest")
         return jax.lax.conv_general_dilated(
             image, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
         )
@@ -87,7 +92,7 @@ def main() -> None:
     pd.enable_compilation_cache()
     cores_as_devices(arguments.batch)  # as `progden train` does
     print(_common.machine(), flush=True)
-    large, images, count = convolution(1, 512, arguments.channels)
+    large, images, count = convolution(1, 512, arguments.channels, by_xla=True)
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         for architecture in arguments.architectures:
