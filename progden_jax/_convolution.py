@@ -3,11 +3,13 @@
 import functools
 from typing import Any
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from flax.linen.dtypes import promote_dtype
 from jax import lax
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from progden_jax import _amx
 from progden_jax._amx_convolution import convolution
@@ -85,6 +87,45 @@ def _jvp(
         along = by_products if jax.default_backend() == "cpu" else _convolve
         slopes.append(along(inputs, by_kernel, _of_products(precision)))
     return out, _total(slopes, out)
+
+
+def rectified_convolution(
+    inputs: Float[Array, "*b h w ci"],
+    kernel: Float[Array, "kh kw ci co"],
+    bias: Float[Array, " co"],
+    *,
+    inside: Bool[Array, "h w 1"] | None = None,
+    precision: Any = None,
+) -> Float[Array, "*b h w co"]:
+    """The ReLU of `same_convolution` and a bias, zero where not inside."""
+    images = inputs.reshape(-1, *inputs.shape[-3:])
+    if planes := _amx.planes(precision, images, kernel, bias):
+        there = None if inside is None else inside[None, :, :, 0].astype(jnp.uint8)
+        settings: dict[str, Any] = {"bias": bias, "inside": there, "relu": True}
+        out = convolution(None, None, images, kernel, planes=planes, **settings)
+    else:
+        out = jax.nn.relu(same_convolution(images, kernel, precision) + bias)
+        out = out if inside is None else jnp.where(inside, out, 0)
+    return out.reshape(*inputs.shape[:-1], kernel.shape[-1])
+
+
+class RectifiedConv(nn.Module):
+    """`rectified_convolution` with the weights of flax's ``Conv`` of that name."""
+
+    features: int
+    size: int
+    kernel_init: Any = nn.initializers.lecun_normal()
+
+    @nn.compact
+    def __call__(
+        self, inputs: Float[Array, "*b h w ci"], inside: Bool[Array, "h w 1"] | None
+    ) -> Float[Array, "*b h w co"]:
+        shape = (self.size, self.size, inputs.shape[-1], self.features)
+        kernel = self.param("kernel", self.kernel_init, shape)
+        bias = self.param("bias", nn.initializers.zeros_init(), (self.features,))
+        # As flax's convolutions do, in the type that all of them promote to.
+        inputs, kernel, bias = promote_dtype(inputs, kernel, bias)
+        return rectified_convolution(inputs, kernel, bias, inside=inside)
 
 
 def _of_products(precision: Any) -> Any:

@@ -11,7 +11,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from progden_jax import _checks, _windows
-from progden_jax._convolution import convolve
+from progden_jax._convolution import RectifiedConv, convolve
 from progden_jax._numeric import safe_sqrt
 
 FEATURES = 18
@@ -76,10 +76,10 @@ class MixingNet(nn.Module):
     ratio: bool = True
 
     def setup(self) -> None:
-        self.conv_in = self._conv(self.width, 5)
-        self.block1_conv1 = self._conv(self.width, 3)
+        self.conv_in = RectifiedConv(self.width, 5)
+        self.block1_conv1 = RectifiedConv(self.width, 3)
         self.block1_conv2 = self._conv(self.width, 3)
-        self.block2_conv1 = self._conv(self.width, 3)
+        self.block2_conv1 = RectifiedConv(self.width, 3)
         self.block2_conv2 = self._conv(self.width, 3)
         self.conv_out = self._conv(9 if self.ratio else 3, 3)
 
@@ -95,12 +95,12 @@ class MixingNet(nn.Module):
         def masked(h: Array) -> Array:
             return h if inside is None else jnp.where(inside, h, 0)
 
-        h = masked(nn.relu(self.conv_in(masked(features))))
+        h = self.conv_in(masked(features), inside)
         for first, second in (
             (self.block1_conv1, self.block1_conv2),
             (self.block2_conv1, self.block2_conv2),
         ):
-            h = masked(nn.relu(h + second(masked(nn.relu(first(h))))))
+            h = masked(nn.relu(h + second(first(h, inside))))
         out = self.conv_out(h)
         return f_act(*jnp.split(out, 3, axis=-1)) if self.ratio else nn.sigmoid(out)
 

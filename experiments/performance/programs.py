@@ -14,6 +14,7 @@ import progden_jax as pd
 from experiments import _common
 from experiments.performance import native
 from progden_jax import mixers
+from progden_jax._bands import in_bands, rows_of
 from progden_jax.denoisers import graph
 from progden_jax.mixers import multiscale
 
@@ -92,11 +93,11 @@ def has_torch() -> bool:
 def parts(scene: Scene, against: Sequence[str]) -> Iterator[Program]:
     """Everything that does not depend on the number of probes."""
     images = (scene.x, scene.y, scene.variance)
-    net, seen = pd.MixingNet(), pd.mixing_features(*images, scene.risk)
+    seen = pd.mixing_features(*images, scene.risk)
     ours = (
         (FORWARD, scene.operations, lambda f, x: f(x), (scene.f, scene.x)),
         (FEATURES, None, pd.mixing_features, (*images, scene.risk)),
-        (NET, scene.operations_of(scene.paper), net.apply, ({"params": scene.paper.params}, seen)),
+        (NET, scene.operations_of(scene.paper), _net, (scene.paper.params, seen)),
         (BOUND, None, pd.t_bound, (scene.alpha, *images)),
         *_shipped_parts(scene),
     )
@@ -110,6 +111,19 @@ def parts(scene: Scene, against: Sequence[str]) -> Iterator[Program]:
         yield Program(FORWARD, None, NATIVE, run, off=_off(run(), answers[FORWARD]))
     if TORCH in against:
         yield from _Torch(scene).parts(answers)
+
+
+def _net(params: Any, seen: Any) -> Any:
+    """As the pipeline runs it: large images in bands of rows."""
+    net = pd.MixingNet()
+    height, width = seen.shape[:2]
+    halo = mixers.build("paper").receptive_radius
+    rows = max(rows_of(height, width), 8 * halo)
+
+    def applied(some: Any) -> Any:
+        return net.apply({"params": params}, some)
+
+    return in_bands(applied, (seen,), height, rows=rows, halo=halo)
 
 
 def _shipped_parts(scene: Scene) -> Iterator[tuple[str, float | None, Callable[..., Any], tuple]]:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from progden_jax import _checks, _windows
-from progden_jax._convolution import convolve
+from progden_jax._convolution import RectifiedConv, convolve
 from progden_jax.mixers._base import Params
 from progden_jax.mixing import level_of
 
@@ -104,21 +104,24 @@ class _Net(nn.Module):
 
     @nn.compact
     def __call__(self, stacked: Array, inside: Array | None) -> Array:
+        def start(scale: float) -> nn.initializers.Initializer:
+            return nn.initializers.variance_scaling(scale, "fan_in", "truncated_normal")
+
         def conv(h: Array, channels: int, size: int, name: str, scale: float) -> Array:
             if inside is not None:
                 h = jnp.where(inside, h, 0)
-            start = nn.initializers.variance_scaling(scale, "fan_in", "truncated_normal")
             return nn.Conv(
                 channels,
                 (size, size),
-                kernel_init=start if scale else nn.initializers.zeros_init(),
+                kernel_init=start(scale) if scale else nn.initializers.zeros_init(),
                 conv_general_dilated=convolve,
                 name=name,
             )(h)
 
         h = nn.relu(conv(stacked, self.width, 1, "conv_in", 1.0))
         for block in range(1, self.blocks + 1):
-            inner = nn.relu(conv(h, self.width, 3, f"block{block}_conv1", 1.0))
+            first = RectifiedConv(self.width, 3, start(1.0), name=f"block{block}_conv1")
+            inner = first(h if inside is None else jnp.where(inside, h, 0), inside)
             h = nn.relu(h + conv(inner, self.width, 3, f"block{block}_conv2", 0.1))
         return conv(h, 3, 3, "conv_out", 0.0)
 
