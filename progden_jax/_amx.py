@@ -43,11 +43,10 @@ _FEWEST = 512
 """Weights of a kernel below which its tiles would be mostly empty."""
 
 
-def planes(precision: Any, *arrays: Any) -> int:
-    """How many bfloat16 stand for each value of a convolution of these; 0 where XLA should do it."""
-    fits = all(jnp.result_type(a) == jnp.float32 for a in arrays)
-    large = max(int(np.prod(jnp.shape(a))) for a in arrays) >= _FEWEST
-    if not (fits and large and available()):
+def planes(precision: Any, kernel: Any, *others: Any) -> int:
+    """How many bfloat16 stand for each value of a convolution by that kernel; 0 where XLA should do it."""
+    fits = all(jnp.result_type(a) == jnp.float32 for a in (kernel, *others))
+    if not (fits and np.size(kernel) >= _FEWEST and available()):
         return 0
     name = precision.name if isinstance(precision, lax.Precision) else str(precision)
     return _PLANES.get(name.lower(), 3)

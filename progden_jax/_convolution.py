@@ -44,7 +44,7 @@ def _convolve(inputs: Array, kernel: Array, precision: Any) -> Array:
     missing = -inputs.shape[-1] % _VECTOR
     if kernel.shape[:2] == (1, 1):
         return jnp.matmul(inputs, kernel[0, 0], precision=_of_products(precision))
-    if planes := _amx.planes(precision, inputs, kernel):
+    if planes := _amx.planes(precision, kernel, inputs):
         return convolution(None, None, inputs, kernel, planes=planes)
     if precision == "bfloat16":
         return lax.conv_general_dilated(
@@ -99,7 +99,7 @@ def rectified_convolution(
 ) -> Float[Array, "*b h w co"]:
     """The ReLU of `same_convolution` and a bias, zero where not inside."""
     images = inputs.reshape(-1, *inputs.shape[-3:])
-    if planes := _amx.planes(precision, images, kernel, bias):
+    if planes := _amx.planes(precision, kernel, images, bias):
         there = None if inside is None else inside[None, :, :, 0].astype(jnp.uint8)
         settings: dict[str, Any] = {"bias": bias, "inside": there, "relu": True}
         out = convolution(None, None, images, kernel, planes=planes, **settings)
@@ -158,7 +158,7 @@ def upsampled_convolution(
     channels = low.shape[-1]
     weights, rest = folded(kernel[:, :, :channels]), kernel[:, :, channels:]
     beside = skip.shape[-1]
-    if planes := _amx.planes(precision, low, skip, kernel):
+    if planes := _amx.planes(precision, kernel, low, skip):
         fine = (skip, rest) if beside else (None, None)
         return convolution(low, weights, *fine, planes=planes)
     joined = 0 < beside <= _FEW

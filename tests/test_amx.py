@@ -113,6 +113,17 @@ def test_bias_relu_gate_and_bounds(rows):
 
 
 @needs_amx
+@pytest.mark.parametrize("precision", ["highest", "bfloat16"])
+def test_few_weights_are_left_to_xla(precision):
+    """However large the image: their tiles would be mostly empty."""
+    image = jnp.zeros((1, 64, 64, 32))
+    assert _amx.planes(precision, jnp.zeros((3, 3, 7, 8)), image) == 0
+    assert _amx.planes(precision, jnp.zeros((3, 3, 8, 8)), image) > 0
+    layer = {"kernel": jnp.zeros((3, 3, 7, 8))}
+    assert not layers.rectifies(layer, precision, image)
+
+
+@needs_amx
 def test_a_part_is_the_same_bits():
     """What a pixel gets hangs neither on where it lies nor on the size of the image."""
     rng = np.random.default_rng(3)

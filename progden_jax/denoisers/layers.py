@@ -45,7 +45,7 @@ def folds(layer: Any, precision: Any) -> bool:
 
 def rectifies(layer: Any, precision: Any, like: Array) -> bool:
     """Where a convolution of such values takes its bias and ReLU along."""
-    return _amx.planes(precision, layer["kernel"], layer.get("bias", layer["kernel"]), like) > 0
+    return _amx.planes(precision, layer["kernel"], like, layer.get("bias", like)) > 0
 
 
 def convolve_rectified(
