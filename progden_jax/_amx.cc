@@ -208,6 +208,7 @@ inline void multiply() {
 template <int P, int M, int N>
 inline void add_taps(const Source& s, const Half* pixels, int64_t stride, const Patch& patch, const Half* kernels,
                      int64_t next) {
+  alignas(64) float unused[kTile * kTile];
   for (int64_t y = 0; y < s.kh; ++y, pixels += patch.row)
     for (int64_t k = 0; k < s.steps; ++k, kernels += P * kHalves) {
       const Half* at = pixels + k * kDepth;
@@ -231,6 +232,8 @@ inline void add_taps(const Source& s, const Half* pixels, int64_t stride, const 
       }
       load_kernels<N>(kernels, next);
       multiply<M, N>();
+      // Kept by nobody: without it storing the sums takes 0.3 us longer, as after any 130 products or more.
+      _tile_stored(6, unused, 64);
     }
 }
 
