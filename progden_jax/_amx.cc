@@ -7,6 +7,7 @@
 // another, begins c values after its neighbour's. So nothing is gathered but what is rounded, patch by patch.
 
 #include <immintrin.h>
+#include <sys/mman.h>
 #include <sys/syscall.h>
 #include <unistd.h>
 
@@ -265,16 +266,38 @@ void add_block(const Job& job, const Patch* patches, const Place& at, float* sum
   if (M > 1 && N > 1) _tile_stored(3, sums + kTile * kRow + kTile, kRow * sizeof(float));
 }
 
+// Where values of a block pass, and as what.
+struct Mask {
+  const uint8_t* inside = nullptr;  // of its first pixel
+  const uint8_t* gate = nullptr;    // of its first pixel and output
+  char bit = 1;
+
+  Mask(const Job& job, const Place& at) {
+    const int64_t y = at.y * job.step + at.i, x = at.x * job.step + at.j;
+    if (job.inside) inside = job.inside + ((job.images > 1 ? at.image : 0) * job.H + y) * job.W + x;
+    if (job.gate)
+      gate = job.gate + ((at.image * (job.H / job.bits) + y / job.bits) * job.W + x) * job.outputs + at.t * kTile;
+    bit = static_cast<char>(1 << y % job.bits);
+  }
+
+  bool any(const Job& job, const Place& at, int64_t pixels) const {
+    bool found = !inside;
+    for (int64_t p = 0; p < pixels && !found; ++p) found = inside[p * job.step];
+    if (!found || !gate) return found;
+    const int64_t left = job.outputs - at.t * kTile;
+    const __mmask32 wanted = left >= 2 * kTile ? ~0u : (1u << left) - 1;
+    __m256i all = _mm256_setzero_si256();
+    for (int64_t p = 0; p < pixels; ++p)
+      all = _mm256_or_si256(all, _mm256_maskz_loadu_epi8(wanted, gate + p * job.step * job.outputs));
+    return !_mm256_testz_si256(all, _mm256_set1_epi8(bit));
+  }
+};
+
 // Sums of a block to the output, through bias, ReLU, gate and bounds.
-void finish(const Job& job, const Place& at, int64_t pixels, const float* sums) {
+void finish(const Job& job, const Place& at, const Mask& mask, int64_t pixels, const float* sums) {
   const int64_t y = at.y * job.step + at.i, x = at.x * job.step + at.j, output = at.t * kTile;
   const int64_t pixel = (at.image * job.H + y) * job.W + x;
-  const uint8_t* inside =
-      job.inside ? job.inside + ((job.images > 1 ? at.image : 0) * job.H + y) * job.W + x : nullptr;
-  const uint8_t* gate = nullptr;
-  if (job.gate)
-    gate = job.gate + ((at.image * (job.H / job.bits) + y / job.bits) * job.W + x) * job.outputs + output;
-  const __m128i bit = _mm_set1_epi8(static_cast<char>(1 << y % job.bits));
+  const __m128i bit = _mm_set1_epi8(mask.bit);
   const __m512 zero = _mm512_setzero_ps();
   for (int64_t half = 0; half < 2; ++half) {
     const __mmask16 wanted = first(job.outputs - output - half * kTile);
@@ -282,16 +305,36 @@ void finish(const Job& job, const Place& at, int64_t pixels, const float* sums) 
     const __m512 bias = job.bias ? _mm512_maskz_loadu_ps(wanted, job.bias + output + half * kTile) : zero;
     float* out = job.out + pixel * job.outputs + output + half * kTile;
     for (int64_t p = 0; p < pixels; ++p, out += job.step * job.outputs) {
-      __mmask16 passes = inside && !inside[p * job.step] ? 0 : 0xffff;
+      __mmask16 passes = mask.inside && !mask.inside[p * job.step] ? 0 : 0xffff;
       __m512 value = _mm512_add_ps(_mm512_load_ps(sums + p * 2 * kTile + half * kTile), bias);
       // As a comparison with 0, so that NaN does not pass either.
       if (job.relu) passes &= _mm512_cmp_ps_mask(value, zero, _CMP_GT_OQ);
-      if (gate) {
-        const uint8_t* of = gate + p * job.step * job.outputs + half * kTile;
+      if (mask.gate) {
+        const uint8_t* of = mask.gate + p * job.step * job.outputs + half * kTile;
         passes &= _mm_test_epi8_mask(_mm_maskz_loadu_epi8(wanted, of), bit);
       }
       _mm512_mask_storeu_ps(out, wanted, _mm512_maskz_mov_ps(passes, value));
     }
+  }
+}
+
+void zero(const Job& job, const Place& at, int64_t pixels) {
+  const int64_t y = at.y * job.step + at.i, x = at.x * job.step + at.j, output = at.t * kTile;
+  float* out = job.out + ((at.image * job.H + y) * job.W + x) * job.outputs + output;
+  const int64_t bytes = std::min(2 * kTile, job.outputs - output) * sizeof(float);
+  for (int64_t p = 0; p < pixels; ++p, out += job.step * job.outputs) std::memset(out, 0, bytes);
+}
+
+// What the sources have around those cells.
+template <int P>
+void gather_all(const Job& job, int64_t image, int64_t y0, int64_t y1, int64_t x0, int64_t x1, Memory* memory,
+                Patch* patches) {
+  for (size_t n = 0; n < job.sources.size(); ++n) {
+    const Source& s = job.sources[n];
+    const int64_t per = s.corners ? 1 : job.step, edge = s.corners ? 0 : 1;
+    patches[n].y = y0 * per - s.kh / 2;
+    patches[n].x = x0 * per - s.kw / 2;
+    gather<P>(s, image, (y1 - y0) * per + s.kh - edge, (x1 - x0) * per + s.kw - edge, memory[n], patches[n]);
   }
 }
 
@@ -307,13 +350,7 @@ void task(const Job& job, int64_t index) {
   const Palette palette;
   _tile_loadconfig(&palette);
   Patch patches[2];
-  for (size_t n = 0; n < job.sources.size(); ++n) {
-    const Source& s = job.sources[n];
-    const int64_t per = s.corners ? 1 : job.step, edge = s.corners ? 0 : 1;
-    patches[n].y = y0 * per - s.kh / 2;
-    patches[n].x = x0 * per - s.kw / 2;
-    gather<P>(s, at.image, (y1 - y0) * per + s.kh - edge, (x1 - x0) * per + s.kw - edge, memory[n], patches[n]);
-  }
+  bool gathered = false;
   alignas(64) float sums[4 * kTile * kTile];
   for (at.i = 0; at.i < job.step; ++at.i)
     for (at.j = 0; at.j < job.step; ++at.j)
@@ -322,9 +359,17 @@ void task(const Job& job, int64_t index) {
           for (at.x = x0; at.x < x1; at.x += kPixels) {
             const int64_t pixels = std::min(kPixels, x1 - at.x);
             const bool one = pixels <= kTile, last = job.tiles() - at.t == 1;
+            const Mask mask(job, at);
+            // Padding around an image is all zeros, and costs no more than writing them.
+            if (!mask.any(job, at, pixels)) {
+              zero(job, at, pixels);
+              continue;
+            }
+            if (!gathered) gather_all<P>(job, at.image, y0, y1, x0, x1, memory, patches);
+            gathered = true;
             (one ? last ? add_block<P, 1, 1> : add_block<P, 1, 2>
                  : last ? add_block<P, 2, 1> : add_block<P, 2, 2>)(job, patches, at, sums);
-            finish(job, at, pixels, sums);
+            finish(job, at, mask, pixels, sums);
           }
   _tile_release();
 }
@@ -378,6 +423,14 @@ void run(Job& job, ffi::ThreadPool& pool) {
   in_parallel(pool, count, [&job](int64_t index) { task<P>(job, index); });
 }
 
+// A large output's first touch otherwise takes as long as a small convolution, a page of 4 KiB at a time.
+void ask_for_huge_pages(void* memory, size_t bytes) {
+  constexpr uintptr_t kHuge = 2 << 20;
+  const uintptr_t at = reinterpret_cast<uintptr_t>(memory);
+  const uintptr_t begin = (at + kHuge - 1) / kHuge * kHuge, end = (at + bytes) / kHuge * kHuge;
+  if (begin < end) madvise(reinterpret_cast<void*>(begin), end - begin, MADV_HUGEPAGE);
+}
+
 using Floats = ffi::Buffer<ffi::F32>;
 using Bytes = ffi::Buffer<ffi::U8>;
 
@@ -404,6 +457,7 @@ ffi::Error convolve(ffi::ThreadPool pool, Floats low, Floats low_kernel, Floats 
   if (inside.element_count()) job.inside = inside.typed_data(), job.images = inside.dimensions()[0];
   job.bits = bits, job.relu = relu;
   if (!out->element_count()) return ffi::Error::Success();
+  ask_for_huge_pages(job.out, out->size_bytes());
   planes == 1 ? run<1>(job, pool) : planes == 2 ? run<2>(job, pool) : run<3>(job, pool);
   return ffi::Error::Success();
 } catch (const std::exception& error) {

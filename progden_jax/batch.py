@@ -78,10 +78,12 @@ def denoise_batch(
     canvases = shared_canvases(sizes or ())
     if devices is None:
         devices = jax.local_devices()
+    job = job_of(denoiser, mixer, method, key, outputs, bound)
     if len(devices) > 1 and max_memory is None:
-        job = job_of(denoiser, mixer, method, key, outputs, bound)
         read = _in_order(_read, frames, at_once * len(devices))
         return _on_devices(read, job, rule_of(skip, job), canvases, devices)
+    # Once, not for every frame.
+    on_device, mixing = jax.device_put((job.denoiser, job.mixer))
     first_of = Once()
 
     def run(given: Frame | Callable[[], Frame]) -> Result:
@@ -92,12 +94,12 @@ def denoise_batch(
         def call() -> Result:
             result = progressive_denoise(
                 frame,
-                denoiser,
-                mixer=mixer,
-                method=method,
-                bound=bound,
-                key=key,
-                outputs=outputs,
+                on_device,
+                mixer=mixing,
+                method=job.method,
+                bound=job.bound or False,
+                key=job.key,
+                outputs=job.outputs,
                 skip=skip,
                 max_memory=max_memory,
                 canvas=canvas,

@@ -14,6 +14,7 @@ from jax import lax
 from progden_jax import _amx, _amx_convolution, denoisers
 from progden_jax._convolution import same_convolution, upsampled_convolution
 from progden_jax._slopes import packed, unpacked
+from progden_jax._upsampling import folded
 from progden_jax.denoisers import _network, layers
 from progden_jax.divergence._reach import radii
 
@@ -110,6 +111,28 @@ def test_bias_relu_gate_and_bounds(rows):
             None, None, image, kernel, planes=3, bias=bias, **settings
         )
         np.testing.assert_array_equal(found, expected)
+
+
+@needs_amx
+@pytest.mark.parametrize("by", ["inside", "gate"])
+@pytest.mark.parametrize("upsampled", [False, True])
+def test_where_nothing_passes(by, upsampled):
+    """Whole blocks and rows of them, which are left out, with what lies there not finite."""
+    rng = np.random.default_rng(4)
+    image, kernel = drawn(rng, 2, 50, 300, 8), drawn(rng, 3, 3, 8, 40)
+    image = image.at[:, 20:, 135:].set(jnp.nan)
+    low = (drawn(rng, 2, 25, 150, 8), folded(drawn(rng, 3, 3, 8, 40))) if upsampled else (None,) * 2
+    passes = np.zeros((2, 50, 300, 40), bool)
+    passes[:, :19, :133] = passes[1, 0, :, 35] = True
+    if by == "inside":
+        settings = {"inside": jnp.asarray(passes[..., 0], jnp.uint8)}
+        passes = np.repeat(passes[..., :1], 40, -1)
+    else:
+        settings = {"gate": packed(jnp.asarray(passes), 2), "bits": 2}
+    summed = _amx_convolution.convolution(*low, image, kernel, planes=3)
+    found = _amx_convolution.convolution(*low, image, kernel, planes=3, **settings)
+    np.testing.assert_array_equal(found, np.where(passes, summed, 0))
+    assert np.isfinite(found).all()
 
 
 @needs_amx

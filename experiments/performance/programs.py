@@ -17,6 +17,7 @@ from progden_jax import mixers
 from progden_jax._bands import in_bands, rows_of
 from progden_jax.denoisers import graph
 from progden_jax.mixers import multiscale
+from progden_jax.mixing import level_of
 
 OURS, NATIVE, TORCH = "progden_jax", "native OIDN", "PyTorch"
 FORWARD, DIVERGENCE, BOUND = "forward pass", "divergence", "t-bound"
@@ -116,21 +117,35 @@ def parts(scene: Scene, against: Sequence[str]) -> Iterator[Program]:
 def _net(params: Any, seen: Any) -> Any:
     """As the pipeline runs it: large images in bands of rows."""
     net = pd.MixingNet()
-    height, width = seen.shape[:2]
-    halo = mixers.build("paper").receptive_radius
-    rows = max(rows_of(height, width), 8 * halo)
 
     def applied(some: Any) -> Any:
         return net.apply({"params": params}, some)
 
-    return in_bands(applied, (seen,), height, rows=rows, halo=halo)
+    return _banded(applied, (seen,), mixers.build("paper").receptive_radius)
+
+
+def _shipped_features(mixer: mixers.NetworkMixer, *images: Any) -> Any:
+    """As the pipeline runs them, and of them a few sums: 54 channels of all of it are never there."""
+    level = level_of(images[0])
+    kernel = jnp.ones((multiscale.CHANNELS, 4))
+
+    def applied(*some: Any) -> Any:
+        return multiscale.features(*some, level=level)[0] @ kernel
+
+    return _banded(applied, images, mixer.receptive_radius)
+
+
+def _banded(f: Callable[..., Any], images: tuple[Any, ...], halo: int) -> Any:
+    height, width = images[0].shape[:2]
+    rows = max(rows_of(height, width), 8 * halo)
+    return in_bands(f, images, height, rows=rows, halo=halo)
 
 
 def _shipped_parts(scene: Scene) -> Iterator[tuple[str, float | None, Callable[..., Any], tuple]]:
     mixer = scene.shipped
     images = (scene.x, scene.y, scene.variance, scene.divergence)
     if isinstance(mixer, mixers.NetworkMixer):
-        yield FEATURES + SHIPPED, None, multiscale.features, images
+        yield FEATURES + SHIPPED, None, _shipped_features, (mixer, *images)
         arguments = (mixer, *images, scene.risk)
         operations = scene.operations_of(mixer)
         yield f"features and net{SHIPPED}", operations, lambda m, *a: m(*a), arguments

@@ -3,11 +3,13 @@
     python -m experiments.performance.skipping [--size 1920x1080] [--frames 100]
 
 A frame whose left half is right already, and one that has converged, against all of it; `denoise_batch`
-against a loop of single calls. Both sides are warm and take turns, answers are checked, and ratios are
-medians over rounds. Writes skipping.csv.
+against a loop of single calls, of frames in memory and from file to file. Both sides are warm and take
+turns, answers are checked, and ratios are medians over rounds. Writes skipping.csv.
 """
 
+import functools
 import statistics
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -119,6 +121,35 @@ def batches(
     label = f"{count} frames of {len(SIZES)} sizes: "
     notes = {"denoise_batch": f"{heavy} compilations of the heavy program"}
     yield from compared({"loop": loop, "denoise_batch": batch}, "loop", rounds, label, notes)
+    with tempfile.TemporaryDirectory() as folder:
+        calls = file_by_file(frames, denoiser, Path(folder))
+        yield from compared(calls, "loop", rounds, f"{count} files of {len(SIZES)} sizes: ", {})
+
+
+def file_by_file(
+    frames: list[pd.Frame], denoiser: Any, folder: Path
+) -> dict[str, Callable[[], None]]:
+    """The same from EXR to EXR."""
+    paths = [folder / f"{i:03}.exr" for i in range(len(frames))]
+    for path, frame in zip(paths, frames, strict=True):
+        pd.write_exr(path, frame)
+
+    def write(path: Path, result: pd.Result) -> None:
+        pd.write_exr(path.with_stem(f"{path.stem}-done"), result.image, overwrite=True)
+
+    def loop() -> None:
+        for path in paths:
+            frame = pd.read_exr(path)
+            write(path, pd.progressive_denoise(frame, denoiser, outputs=["image"]))
+
+    def batch() -> None:
+        readers = [functools.partial(pd.read_exr, path) for path in paths]
+        sizes = [frame.size for frame in frames]
+        results = pd.denoise_batch(readers, denoiser, sizes=sizes)
+        for path, result in zip(paths, results, strict=True):
+            write(path, result)
+
+    return {"loop": loop, "denoise_batch": batch}
 
 
 def compared(
