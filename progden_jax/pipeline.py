@@ -18,7 +18,6 @@ from progden_jax.frame import Frame
 from progden_jax.mixers import default_for
 from progden_jax.mixing import Mixer
 from progden_jax.skipping import Skip, Skipped
-from progden_jax.survey import crop
 from progden_jax.tstatistic import Bound
 
 __all__ = ["DEFAULT_METHOD", "OUTPUTS", "Denoised", "Result", "denoise", "progressive_denoise"]
@@ -186,9 +185,7 @@ def _where_needed(
     """
     variance = cast(Array, frame.variance)
     skip = skip.for_size(canvas)
-    active = skipping.noisy_tiles(
-        crop(frame.color, (0, 0), canvas), crop(variance, (0, 0), canvas), skip
-    )
+    active = skipping.noisy_tiles(frame.color, variance, skip, canvas)
     windows = None
     if not active.any():
         windows = []

@@ -16,6 +16,9 @@ MARGIN = 5
 _MOST_TILES = 128
 """Along an edge, for finding the cheapest windows takes time too."""
 
+_PART = 1 << 14
+"""Pixels."""
+
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
@@ -68,26 +71,43 @@ class Skipped:
 
 
 def noisy(
-    color: Float[Array, "h w 3"],
-    variance: Float[Array, "h w 3"],
+    color: Float[Array | np.ndarray, "*pixels 3"],
+    variance: Float[Array | np.ndarray, "*pixels 3"],
     tolerance: float | Array,
     numpy: Any = jnp,
-) -> Bool[Array, "h w"]:
+) -> Bool[Array | np.ndarray, "*pixels"]:
     """Pixels that are not right yet, bad values among them; by `jax.numpy`, or NumPy if told."""
     right = (variance <= (tolerance * color) ** 2) & numpy.isfinite(color)
-    return ~right.all(-1)
+    # Not all(-1), which takes NumPy as long as everything else here.
+    red, green, blue = (right[..., channel] for channel in range(3))
+    return ~(red & green & blue)
 
 
 def noisy_tiles(
-    color: Float[Array, "h w 3"], variance: Float[Array, "h w 3"], skip: Skip
+    color: Float[Array, "h w 3"],
+    variance: Float[Array, "h w 3"],
+    skip: Skip,
+    canvas: tuple[int, int] | None = None,
 ) -> Bool[np.ndarray, "rows columns"]:
-    """Tiles with a pixel that is not right yet, in them or within `MARGIN` of them."""
-    return np.asarray(_noisy_tiles(color, variance, skip.tolerance, skip.tile))
+    """Tiles with a pixel that is not right yet, in them or within `MARGIN` of them.
+
+    Of `canvas` (height, width) where that is given; what it has beyond the image is right.
+    """
+    height, width = color.shape[:2]
+    # On the host and in parts that stay in the cache: XLA would first copy the whole images.
+    colors, variances = (np.asarray(image).reshape(-1, 3) for image in (color, variance))
+    found = np.empty(height * width, bool)
+    with np.errstate(all="ignore"):
+        for begin in range(0, len(found), _PART):
+            part = slice(begin, begin + _PART)
+            found[part] = noisy(colors[part], variances[part], skip.tolerance, np)
+    on = np.zeros(canvas or (height, width), bool)
+    on[:height, :width] = found.reshape(height, width)
+    return np.asarray(_tiles(on, skip.tile))
 
 
 @functools.partial(jax.jit, static_argnames="tile")
-def _noisy_tiles(color: Array, variance: Array, tolerance: float, tile: int) -> Array:
-    found = noisy(color, variance, tolerance)
+def _tiles(found: Array, tile: int) -> Array:
     for axis in (0, 1):
         length = found.shape[axis]
         tiles = math.ceil(length / tile)

@@ -106,6 +106,20 @@ def test_noisy_tiles_against_a_plain_loop(tile):
         rows = slice(max(i * tile - 5, 0), (i + 1) * tile + 5)
         columns = slice(max(j * tile - 5, 0), (j + 1) * tile + 5)
         assert noisy == (variance[rows, columns] > 0).any()
+    on_canvas = skipping.noisy_tiles(color, variance, pd.Skip(tile=tile), (144, 96))
+    assert on_canvas.shape == (-(-144 // tile), -(-96 // tile))
+    rows, columns = found.shape
+    np.testing.assert_array_equal(on_canvas[:rows, :columns], found)
+    # What is beyond the image is noisy only where its margin reaches in.
+    assert not on_canvas[rows + 1 :].any()
+
+
+def test_a_large_image_is_looked_at_in_parts():
+    color = np.ones((300, 200, 3), np.float32)
+    variance = np.zeros_like(color)
+    variance[299, 199] = 1
+    found = skipping.noisy_tiles(color, variance, pd.Skip())
+    assert list(zip(*np.nonzero(found), strict=True)) == [(18, 12)]
 
 
 def test_settings_are_checked():
