@@ -33,6 +33,9 @@ some times as much, but once."""
 AT_ONCE = 2
 """Frames in work: while one is read, prepared or handed on, another computes."""
 
+_SMALL, _SMALL_AT_ONCE = 1 << 18, 4
+"""So few pixels leave cores without work now and then, and take little memory: more of them are in work."""
+
 
 def denoise_batch(
     frames: Sequence[Frame] | Iterable[Frame | Callable[[], Frame]],
@@ -46,7 +49,7 @@ def denoise_batch(
     skip: Skip | bool = True,
     max_memory: int | None = None,
     sizes: Sequence[Size] | None = None,
-    at_once: int = AT_ONCE,
+    at_once: int | None = None,
     devices: Sequence[Device] | None = None,
 ) -> Iterator[Result]:
     """`progressive_denoise` of every frame, in order, as they are asked for.
@@ -62,7 +65,8 @@ def denoise_batch(
     sizes : (height, width) of every frame, where they are known beforehand but `frames` does not tell: then
         at most three programs serve them all. Of frames in a sequence they are taken. Else every
         size has that of its canvas.
-    at_once : frames in work, and so in memory, per device.
+    at_once : frames in work, and so in memory, per device. None: two, or four where `sizes` are known and
+        small.
     devices : several compute a frame each at the same time, or with `max_memory` a window each of the same
         frame. None: all of this process. In a run of several processes (``jax.distributed``) give each
         its share of the frames, such as ``frames[jax.process_index()::jax.process_count()]``.
@@ -72,10 +76,12 @@ def denoise_batch(
     ValueError
         As `progressive_denoise`, when the frame's turn comes.
     """
-    _checks.positive_int("at_once", at_once)
     if sizes is None and isinstance(frames, Sequence) and all(isinstance(f, Frame) for f in frames):
         sizes = [f.size for f in frames if isinstance(f, Frame)]
     canvases = shared_canvases(sizes or ())
+    if at_once is None:
+        at_once = at_once_of(canvases)
+    _checks.positive_int("at_once", at_once)
     if devices is None:
         devices = jax.local_devices()
     job = job_of(denoiser, mixer, method, key, outputs, bound)
@@ -199,6 +205,12 @@ def shared_canvases(sizes: Iterable[Size], most: int = PROGRAMS) -> dict[Size, S
         members = groups.pop(a) + groups.pop(b)
         groups[union] = groups.get(union, []) + members
     return {member: shape for shape, members in groups.items() for member in members}
+
+
+def at_once_of(canvases: dict[Size, Size]) -> int:
+    """Frames to have in work, of those shapes where they are known, see `shared_canvases`."""
+    small = canvases and all(height * width <= _SMALL for height, width in canvases.values())
+    return _SMALL_AT_ONCE if small else AT_ONCE
 
 
 class Once:

@@ -88,6 +88,12 @@ def test_what_a_frame_raises_comes_in_its_turn(frames, denoiser):
         next(pd.denoise_batch(frames, denoiser, at_once=0))
 
 
+def test_more_small_frames_are_in_work(frames):
+    small = batch.shared_canvases([f.size for f in frames])
+    large = batch.shared_canvases([(64, 64), (1080, 1920)])
+    assert batch.at_once_of(small) > batch.at_once_of(large) == batch.at_once_of({}) == 2
+
+
 def test_a_canvas_must_hold_the_frame(frames, denoiser):
     with pytest.raises(ValueError, match=r"canvas is \(48, 16\), expected .* at least \(40, 50\)"):
         pd.progressive_denoise(frames[0], denoiser, canvas=(48, 16))

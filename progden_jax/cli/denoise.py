@@ -116,19 +116,19 @@ def denoise(
         print_json([]) if json else print("every output exists: nothing was left to do")
         return OK
     from progden_jax import enable_compilation_cache
-    from progden_jax.batch import AT_ONCE
+    from progden_jax.batch import at_once_of
     from progden_jax.cli._job import Settings, process, shared_shapes
 
     enable_compilation_cache()
-    settings = Settings(
-        read, network, adaptation, estimate, cost, saved, half, force, shared_shapes(items)
-    )
+    shapes = shared_shapes(items)
+    settings = Settings(read, network, adaptation, estimate, cost, saved, half, force, shapes)
+    # What reports progress of its own takes all there is for as long as it takes.
+    alone = estimate.exact or adaptation.fits or cost.max_memory is not None
     return _run_all(
         items,
         lambda item, outcome, progress: process(item, settings, outcome, progress),
         json=json,
-        # What reports progress of its own takes all there is for as long as it takes.
-        at_once=1 if estimate.exact or adaptation.fits or cost.max_memory is not None else AT_ONCE,
+        at_once=1 if alone else at_once_of(shapes),
     )
 
 
