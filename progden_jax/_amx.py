@@ -65,7 +65,7 @@ def status() -> str | None:
     if missing := _NEEDED - _cpu_flags():
         return f"the CPU has no {', '.join(sorted(missing))}"
     try:
-        library = ctypes.CDLL(str(_library()))
+        library = _loaded()
         if not library.progden_asks_for_amx():
             return "the system does not let this process use AMX"
         jax.ffi.register_ffi_target(
@@ -85,9 +85,18 @@ def _cpu_flags() -> set[str]:
     return set()
 
 
-def _library() -> Path:
-    """The compiled `_amx.cc`: made once per compiler, flags and jaxlib."""
+def _loaded() -> ctypes.CDLL:
+    """The compiled `_amx.cc`: from the cache folder, or made for this process where it cannot be kept."""
     compiler = _compiler()
+    try:
+        return ctypes.CDLL(str(_cached(compiler)))
+    except OSError:
+        with tempfile.TemporaryDirectory(prefix="progden-") as scratch:
+            return ctypes.CDLL(str(_compiled(compiler, Path(scratch) / "amx.so")))
+
+
+def _cached(compiler: str) -> Path:
+    """The library in the cache folder: made once per compiler, flags and jaxlib."""
     version = subprocess.run(
         [compiler, "--version"], capture_output=True, timeout=_PATIENCE, check=True
     ).stdout
@@ -97,17 +106,12 @@ def _library() -> Path:
         repr(_FLAGS).encode(),
         importlib.metadata.version("jaxlib").encode(),
     )
-    name = f"amx-{hashlib.sha256(b'|'.join(parts)).hexdigest()[:20]}.so"
-    folder = cache_folder()
-    if (folder / name).is_file():
-        return folder / name
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder, prefix=".amx-") as scratch:
-            os.replace(_compiled(compiler, Path(scratch) / name), folder / name)
-        return folder / name
-    except PermissionError:
-        return _compiled(compiler, Path(tempfile.mkdtemp(prefix="progden-")) / name)
+    path = cache_folder() / f"amx-{hashlib.sha256(b'|'.join(parts)).hexdigest()[:20]}.so"
+    if not path.is_file():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".amx-") as scratch:
+            os.replace(_compiled(compiler, Path(scratch) / path.name), path)
+    return path
 
 
 def _compiler() -> str:
