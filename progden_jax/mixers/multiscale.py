@@ -150,15 +150,17 @@ def features(
     level : mean radiance of the whole image, where these are a tile of it; by default that of `x`.
     without : `GROUPS` of features to give as zeros.
     """
-    counted = jnp.ones_like(x[..., :1]) if inside is None else inside.astype(x.dtype)
+    counted = jnp.ones_like(x) if inside is None else jnp.broadcast_to(inside, x.shape)
 
+    # Of every channel, though all are the same: XLA turns a division by what is broadcast into a product, and
+    # products and the sums before them it repeats in every use, channel by channel.
     @functools.cache  # tracing takes time, too
     def pixels(window: int) -> Array:
-        return jnp.maximum(_windows.box_sum(counted, window), 1)
+        return jnp.maximum(_windows.box_sum(counted.astype(x.dtype), window), 1)
 
     def mean(value: Array, window: int) -> Array:
         value = value if inside is None else jnp.where(inside, value, 0)
-        return _windows.box_sum(value, window) / pixels(window)
+        return _windows.box_sum(value, window) / pixels(window)[..., : value.shape[-1]]
 
     # In units of the image's mean no square here leaves float32's range, nor its derivatives.
     if level is None:
