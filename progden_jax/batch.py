@@ -1,14 +1,16 @@
 """Many frames of mixed sizes: few programs, and reading beside computing."""
 
+import contextlib
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from typing import Any
 
 import jax
 
-from progden_jax import _checks
+from progden_jax import _checks, memory
 from progden_jax._canvas import call_of, canvas_size, cropped, has_canvas
 from progden_jax._devices import Device, on_each
 from progden_jax._program import Job, checked_variance
@@ -115,7 +117,8 @@ def denoise_batch(
 
         return first_of((canvas, frame.albedo is None, frame.normal is None), call)
 
-    return _in_order(run, frames, at_once)
+    small = are_small(canvases) and max_memory is None
+    return _in_order(run, frames, at_once, memory.kept if small else contextlib.nullcontext)
 
 
 def _read(frame: Frame | Callable[[], Frame]) -> Frame:
@@ -209,8 +212,12 @@ def shared_canvases(sizes: Iterable[Size], most: int = PROGRAMS) -> dict[Size, S
 
 def at_once_of(canvases: dict[Size, Size]) -> int:
     """Frames to have in work, of those shapes where they are known, see `shared_canvases`."""
-    small = canvases and all(height * width <= _SMALL for height, width in canvases.values())
-    return _SMALL_AT_ONCE if small else AT_ONCE
+    return _SMALL_AT_ONCE if are_small(canvases) else AT_ONCE
+
+
+def are_small(canvases: dict[Size, Size]) -> bool:
+    """Whether the shapes are known, see `shared_canvases`, and each has so few pixels."""
+    return bool(canvases) and all(height * width <= _SMALL for height, width in canvases.values())
 
 
 class Once:
@@ -232,16 +239,22 @@ class Once:
         return result
 
 
-def _in_order(run: Callable[[Any], Any], items: Iterable[Any], at_once: int) -> Iterator[Any]:
+def _in_order(
+    run: Callable[[Any], Any],
+    items: Iterable[Any],
+    at_once: int,
+    during: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext,
+) -> Iterator[Any]:
     """`run` of every item on threads; what a caller does not ask for any more is not begun."""
     pending: deque[Future[Any]] = deque()
-    pool = ThreadPoolExecutor(at_once, thread_name_prefix="progden")
-    try:
-        for item in items:
-            pending.append(pool.submit(run, item))
-            if len(pending) > at_once:
+    with during():
+        pool = ThreadPoolExecutor(at_once, thread_name_prefix="progden")
+        try:
+            for item in items:
+                pending.append(pool.submit(run, item))
+                if len(pending) > at_once:
+                    yield pending.popleft().result()
+            while pending:
                 yield pending.popleft().result()
-        while pending:
-            yield pending.popleft().result()
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)

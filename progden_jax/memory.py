@@ -6,7 +6,8 @@ import functools
 import math
 import os
 import re
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -116,6 +117,63 @@ def _trim_after_compiling() -> None:
             trim()
 
     jax.monitoring.register_event_duration_secs_listener(listen)
+
+
+@contextlib.contextmanager
+def kept() -> Iterator[None]:
+    """What is freed in this block stays with the process, which so need not ask for each page again.
+
+    For small images, one after the other: they free and take the same some hundred MB again and again. It is
+    given back at the end of the block, or of the last of several at a time. No-op without glibc, or where
+    the user has set what glibc keeps.
+    """
+    if not _is_ours_to_set():
+        yield
+        return
+    with _KEPT.lock:
+        _KEPT.blocks += 1
+        if _KEPT.blocks == 1:
+            _set(_KEEP)
+    try:
+        yield
+    finally:
+        with _KEPT.lock:
+            _KEPT.blocks -= 1
+            if _KEPT.blocks == 0:
+                _set(_USUAL)
+                trim()
+
+
+# Of malloc.h: M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD, M_MMAP_MAX. The latter are what glibc adapts to
+# by itself once something of 32 MiB was freed; told anything, it adapts no longer.
+_KEEP = {-1: 2**31 - 1, -2: 64 << 20, -4: 0}
+_USUAL = {-1: 64 << 20, -2: 128 << 10, -3: 32 << 20, -4: 1 << 16}
+
+
+class _Kept:
+    """How many blocks of `kept` are open, in all threads."""
+
+    def __init__(self) -> None:
+        self.lock, self.blocks = threading.Lock(), 0
+
+
+_KEPT = _Kept()
+
+
+def _set(options: dict[int, int]) -> None:
+    for option, value in options.items():
+        ctypes.CDLL(None).mallopt(option, value)
+
+
+@functools.cache
+def _is_ours_to_set() -> bool:
+    chosen = " ".join((*os.environ, os.environ.get("GLIBC_TUNABLES", "")))
+    if re.search(r"MALLOC_(TRIM|TOP|MMAP)_|malloc\.(trim|top|mmap)_", chosen):
+        return False
+    try:
+        return bool(ctypes.CDLL(None).gnu_get_libc_version)
+    except (OSError, AttributeError):
+        return False
 
 
 HUGE_PAGES = "glibc.malloc.hugetlb=1"

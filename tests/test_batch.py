@@ -1,5 +1,6 @@
 """Many frames: the same results as one by one, in order, from few programs."""
 
+import resource
 import threading
 
 import jax
@@ -10,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import progden_jax as pd
-from progden_jax import batch, pipeline, tiling
+from progden_jax import batch, memory, pipeline, tiling
 
 
 @pytest.fixture(scope="module")
@@ -92,6 +93,44 @@ def test_more_small_frames_are_in_work(frames):
     small = batch.shared_canvases([f.size for f in frames])
     large = batch.shared_canvases([(64, 64), (1080, 1920)])
     assert batch.at_once_of(small) > batch.at_once_of(large) == batch.at_once_of({}) == 2
+
+
+def test_small_frames_keep_what_they_free_until_the_last(frames, denoiser, monkeypatch):
+    said = []
+    monkeypatch.setattr(memory, "_is_ours_to_set", lambda: True)
+    monkeypatch.setattr(memory, "_set", said.append)
+    two = [pd.denoise_batch(frames[:2], denoiser) for _ in range(2)]
+    assert said == []
+    for results in two:
+        next(results)
+    assert said == [memory._KEEP]
+    two[0].close()
+    assert said == [memory._KEEP]
+    list(two[1])
+    assert said == [memory._KEEP, memory._USUAL]
+    # Of unknown size, or where memory is bounded, nothing is kept.
+    list(pd.denoise_batch(iter(frames[:1]), denoiser))
+    list(pd.denoise_batch(frames[:1], denoiser, max_memory=10**10))
+    assert len(said) == 2
+
+
+@pytest.mark.skipif(not memory._is_ours_to_set(), reason="no glibc, or told by the environment")
+def test_what_is_kept_is_not_touched_anew():
+    size = 48 << 20
+
+    def faults():
+        begun = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+        for _ in range(8):
+            bytearray(b"x") * size
+        return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - begun
+
+    before = faults()
+    with memory.kept():
+        held = memory.resident()
+        assert faults() < before / 3
+        assert memory.resident() > held + size / 2
+    assert memory.resident() < held + size / 2
+    assert faults() > before / 2
 
 
 def test_a_canvas_must_hold_the_frame(frames, denoiser):

@@ -1,5 +1,6 @@
 """`progden denoise`: files in, files out."""
 
+import contextlib
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -115,8 +116,8 @@ def denoise(
     if not items:
         print_json([]) if json else print("every output exists: nothing was left to do")
         return OK
-    from progden_jax import enable_compilation_cache
-    from progden_jax.batch import at_once_of
+    from progden_jax import enable_compilation_cache, memory
+    from progden_jax.batch import are_small, at_once_of
     from progden_jax.cli._job import Settings, process, shared_shapes
 
     enable_compilation_cache()
@@ -124,12 +125,14 @@ def denoise(
     settings = Settings(read, network, adaptation, estimate, cost, saved, half, force, shapes)
     # What reports progress of its own takes all there is for as long as it takes.
     alone = estimate.exact or adaptation.fits or cost.max_memory is not None
-    return _run_all(
-        items,
-        lambda item, outcome, progress: process(item, settings, outcome, progress),
-        json=json,
-        at_once=1 if alone else at_once_of(shapes),
-    )
+    many = len(items) > 1 and are_small(shapes) and not alone
+    with memory.kept() if many else contextlib.nullcontext():
+        return _run_all(
+            items,
+            lambda item, outcome, progress: process(item, settings, outcome, progress),
+            json=json,
+            at_once=1 if alone else at_once_of(shapes),
+        )
 
 
 def _run_all(
