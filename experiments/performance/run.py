@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
+from matplotlib.ticker import LogLocator, NullFormatter
 
 import progden_jax as pd
 from experiments import _common
@@ -355,7 +355,11 @@ def figure(rows: Sequence[Row], off: Sequence[Error], probes: int) -> Figure:
         counts = ", ".join(str(k) for k in sorted({e.probes for e in off} - {0}))
         title = f"divergence at {off[0].size}, {counts} probes"
         axes[2].set(title=title, xlabel="ms", ylabel="relative RMSE")
-        axes[2].legend()
+        axes[2].legend(loc="lower left")
+        for axis in (axes[2].xaxis, axes[2].yaxis):
+            axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axis.set_major_formatter("{x:g}")
+            axis.set_minor_formatter(NullFormatter())
     return made
 
 
