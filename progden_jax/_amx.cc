@@ -5,6 +5,9 @@
 //
 // An image's pixels are rows of a matrix as they lie in memory: a row of taps, kw * c values one after
 // another, begins c values after its neighbour's. So nothing is gathered but what is rounded, patch by patch.
+//
+// Down the columns a kernel's taps are the coefficients of a polynomial. R rows of outputs from T taps take
+// R + T - 1 products of lines, each a sum of rows, where there were R * T (Toom and Cook).
 
 #include <immintrin.h>
 #include <sys/mman.h>
@@ -82,6 +85,62 @@ inline void split(__m512 x, __m256i (&parts)[P]) {
   }
 }
 
+// A sum of vectors; the weights are constants, and most of them 0 or 1.
+template <int Q>
+inline __m512 combined(const float (&weights)[Q], const __m512 (&vectors)[Q]) {
+  __m512 sum = _mm512_setzero_ps();
+  bool begun = false;
+#pragma GCC unroll 8
+  for (int q = 0; q < Q; ++q) {
+    if (weights[q] == 0) continue;
+    const __m512 weight = _mm512_set1_ps(weights[q]);
+    if (begun) sum = weights[q] == 1 ? _mm512_add_ps(sum, vectors[q]) : _mm512_fmadd_ps(weight, vectors[q], sum);
+    else sum = weights[q] == 1 ? vectors[q] : _mm512_mul_ps(weight, vectors[q]);
+    begun = true;
+  }
+  return sum;
+}
+
+// R rows of outputs from lines, which are sums of rows of the image, and kernels of lines, sums of rows of taps:
+// out * ((taps * kernel) x (in * image)). At infinity and the finite points that `_points.py` found to round least.
+template <int R_, int T_>
+struct Toom {
+  static constexpr int R = R_, T = T_, Q = R + T - 1;
+  static constexpr bool kSummed = false;  // Each line has sums of its own.
+  float in[Q][Q] = {}, taps[Q][T] = {}, out[R][Q] = {};
+
+  constexpr explicit Toom(const double (&points)[Q - 1]) {
+    for (int q = 0; q < Q; ++q) {
+      const bool finite = q < Q - 1;
+      double product[Q] = {1}, scale = 1;  // of x minus each other finite point, lowest power first
+      for (int k = 0, degree = 0; k < Q - 1; ++k) {
+        if (k == q) continue;
+        for (int j = ++degree; j >= 0; --j) product[j] = (j ? product[j - 1] : 0) - points[k] * product[j];
+        if (finite) scale *= points[q] - points[k];
+      }
+      for (int j = 0; j < Q; ++j) in[q][j] = static_cast<float>(product[j]);
+      double power = 1;
+      for (int j = 0; j < Q; ++j) {
+        if (j < T) taps[q][j] = static_cast<float>(finite ? power / scale : j == T - 1);
+        if (j < R) out[j][q] = static_cast<float>(finite ? power : j == R - 1);
+        if (finite) power *= points[q];
+      }
+    }
+  }
+};
+
+constexpr double kFive[] = {0, 1, -2, -0.5}, kSix[] = {0, 1.5, -1.5, 2. / 3, -2. / 3};
+struct Toom43 : Toom<4, 3> { constexpr Toom43() : Toom(kSix) {} };
+struct Toom25 : Toom<2, 5> { constexpr Toom25() : Toom(kSix) {} };
+struct Toom42 : Toom<4, 2> { constexpr Toom42() : Toom(kFive) {} };
+
+// Row by row, for any kernel: lines are rows, and what belongs to one row of outputs is summed.
+struct Direct {
+  static constexpr int R = 1, T = 0, Q = 1;
+  static constexpr bool kSummed = true;
+  float in[1][1] = {{1}}, out[1][1] = {{1}};
+};
+
 struct Source {
   const float* image;   // n, h, w, c
   int64_t h, w, c;
@@ -90,13 +149,23 @@ struct Source {
   // At half the output's size, with the four pixels over each cell of it as outputs: a 2x2 kernel whose
   // window begins one row and column before the cell for those above and left, at the cell for the others.
   bool corners;
-  Memory memory;
-  Half* packed = nullptr;  // [parity][16 outputs][row of taps][step][plane] tiles
-  int64_t steps = 0;       // of a row of taps
+};
+
+// Rows of a source's taps that lie as far apart as rows of cells do.
+struct Part {
+  Source of;
+  int64_t every, offset;      // Cells at y, of parity i, begin at the source's row y * every + offset + i.
+  std::vector<int64_t> taps;  // rows of the kernel
+  Memory memory = {};
+  Half* packed = nullptr;     // [parity][16 outputs][line][step][plane] tiles
+  int64_t steps = 0;          // of a row of taps
+
+  template <class S>
+  int64_t lines() const { return S::kSummed ? taps.size() : S::Q; }
 };
 
 struct Job {
-  std::vector<Source> sources;
+  std::vector<Part> parts;
   const float* bias = nullptr;      // outputs
   const uint8_t* gate = nullptr;    // n, H / bits, W, outputs: where values pass, a bit for each of `bits` rows
   const uint8_t* inside = nullptr;  // images, H, W: zero elsewhere
@@ -112,74 +181,102 @@ struct Job {
 
 struct Patch {
   Half* data;
-  int64_t y, x, row, plane;  // where it begins; halves from row to row and plane to plane
+  int64_t x, row, plane;  // its first column; halves from line to line and plane to plane
 };
 
-template <int P>
-void pack(const Job& job, Source& s) {
-  const int64_t parities = s.corners ? 4 : 1, depth = s.kw * s.c, stride = parities * job.outputs;
-  s.steps = (depth + kDepth - 1) / kDepth;
-  s.packed = s.memory.reserve<Half>(parities * job.tiles() * s.kh * s.steps * P * kHalves);
-  Half* to = s.packed;
-  for (int64_t q = 0; q < parities; ++q)
-    for (int64_t t = 0; t < job.tiles(); ++t)
-      for (int64_t y = 0; y < s.kh; ++y)
-        for (int64_t step = 0; step < s.steps; ++step, to += P * kHalves)
-          for (int64_t pair = 0; pair < kTile; ++pair) {
-            const __mmask16 mask = first(job.outputs - t * kTile);
-            const int64_t k = step * kDepth + 2 * pair;
-            const float* from = s.kernel + (y * depth + k) * stride + q * job.outputs + t * kTile;
-            __m256i even[P], odd[P];
-            split<P>(_mm512_maskz_loadu_ps(k < depth ? mask : 0, from), even);
-            split<P>(_mm512_maskz_loadu_ps(k + 1 < depth ? mask : 0, from + stride), odd);
-            for (int p = 0; p < P; ++p) {
-              const __m512i high = _mm512_slli_epi32(_mm512_cvtepu16_epi32(odd[p]), 16);
-              _mm512_store_si512(to + p * kHalves + pair * kDepth,
-                                 _mm512_or_si512(high, _mm512_cvtepu16_epi32(even[p])));
-            }
-          }
+// Of one line: outputs from that tile on, for a pair of inputs one after the other.
+template <int P, class S>
+void pack_line(const Job& job, const Part& part, int64_t parity, int64_t t, int64_t line, Half* to) {
+  static constexpr S scheme{};
+  const Source& s = part.of;
+  const int64_t depth = s.kw * s.c, stride = (s.corners ? 4 : 1) * job.outputs;
+  const __mmask16 mask = first(job.outputs - t * kTile);
+  const float* at = s.kernel + (s.corners ? parity : 0) * job.outputs + t * kTile;
+  auto value = [&](int64_t k) {
+    auto tap = [&](int64_t n) { return _mm512_maskz_loadu_ps(mask, at + (part.taps[n] * depth + k) * stride); };
+    if (k >= depth) return _mm512_setzero_ps();
+    if constexpr (S::kSummed) {
+      return tap(line);
+    } else {
+      __m512 sum = _mm512_setzero_ps();
+      for (size_t n = 0; n < part.taps.size(); ++n)
+        sum = _mm512_fmadd_ps(_mm512_set1_ps(scheme.taps[line][n]), tap(n), sum);
+      return sum;
+    }
+  };
+  for (int64_t k = 0; k < part.steps * kDepth; k += 2, to += (k % kDepth ? kDepth : kDepth + (P - 1) * kHalves)) {
+    __m256i even[P], odd[P];
+    split<P>(value(k), even);
+    split<P>(value(k + 1), odd);
+    for (int p = 0; p < P; ++p) {
+      const __m512i high = _mm512_slli_epi32(_mm512_cvtepu16_epi32(odd[p]), 16);
+      _mm512_store_si512(to + p * kHalves, _mm512_or_si512(high, _mm512_cvtepu16_epi32(even[p])));
+    }
+  }
 }
 
-// Pixels from (patch.y, patch.x), zeros beyond the image, as P bfloat16 each.
-template <int P>
-void gather(const Source& s, int64_t image, int64_t rows, int64_t columns, Memory& memory, Patch& patch) {
+template <int P, class S>
+void pack(const Job& job, Part& part) {
+  const int64_t parities = part.of.corners ? 4 : 1, lines = part.lines<S>();
+  part.steps = (part.of.kw * part.of.c + kDepth - 1) / kDepth;
+  part.packed = part.memory.reserve<Half>(parities * job.tiles() * lines * part.steps * P * kHalves);
+  Half* to = part.packed;
+  for (int64_t parity = 0; parity < parities; ++parity)
+    for (int64_t t = 0; t < job.tiles(); ++t)
+      for (int64_t line = 0; line < lines; ++line, to += part.steps * P * kHalves)
+        pack_line<P, S>(job, part, parity, t, line, to);
+}
+
+// Lines of the rows from `y` on, so many times R of them, and of columns from patch.x: zeros beyond the image, as P
+// bfloat16 each.
+template <int P, class S>
+void gather(const Part& part, int64_t image, int64_t y, int64_t times, int64_t columns, Memory& memory, Patch& patch) {
+  static constexpr S scheme{};
+  const Source& s = part.of;
   patch.row = columns * s.c;
   // A block may reach beyond the last pixel: what it finds there is not kept, but must be there to be read.
-  const int64_t beyond = (2 * kPixels + s.kw) * s.c + 2 * kDepth;
-  patch.plane = (rows * patch.row + beyond + kDepth - 1) / kDepth * kDepth;
+  const int64_t beyond = (2 * kPixels + s.kw) * s.c + 2 * kDepth, lines = times * S::Q;
+  patch.plane = (lines * patch.row + beyond + kDepth - 1) / kDepth * kDepth;
   patch.data = memory.reserve<Half>(P * patch.plane);
-  const int64_t left = std::clamp<int64_t>(-patch.x, 0, columns) * s.c;
-  const int64_t right = std::max(std::clamp<int64_t>(s.w - patch.x, 0, columns) * s.c, left);
+  const int64_t begin = std::clamp<int64_t>(-patch.x, 0, columns) * s.c;
+  const int64_t end = std::max(std::clamp<int64_t>(s.w - patch.x, 0, columns) * s.c, begin);
   for (int p = 0; p < P; ++p)
-    std::memset(patch.data + p * patch.plane + rows * patch.row, 0,
-                (patch.plane - rows * patch.row) * sizeof(Half));
-  for (int64_t r = 0; r < rows; ++r) {
-    const int64_t y = patch.y + r;
-    const bool there = y >= 0 && y < s.h;
-    const int64_t begin = there ? left : 0, end = there ? right : 0;
-    Half* to = patch.data + r * patch.row;
-    for (int p = 0; p < P; ++p) {
-      std::memset(to + p * patch.plane, 0, begin * sizeof(Half));
-      std::memset(to + p * patch.plane + end, 0, (patch.row - end) * sizeof(Half));
-    }
-    const float* from = s.image + ((image * s.h + y) * s.w + patch.x) * s.c;
-    int64_t k = begin;
-    for (; k + 2 * kTile <= end; k += 2 * kTile) {
-      __m512 low = _mm512_loadu_ps(from + k), high = _mm512_loadu_ps(from + k + kTile);
+    std::memset(patch.data + p * patch.plane + lines * patch.row, 0,
+                (patch.plane - lines * patch.row) * sizeof(Half));
+  for (int64_t n = 0; n < times; ++n) {
+    Half* to = patch.data + n * S::Q * patch.row;
+    for (int q = 0; q < S::Q; ++q)
       for (int p = 0; p < P; ++p) {
-        const __m512i both = (__m512i)_mm512_cvtne2ps_pbh(high, low);
-        _mm512_storeu_si512(to + p * patch.plane + k, both);
-        if (p + 1 < P) {
-          low = rest(low, widened(_mm512_castsi512_si256(both)));
-          high = rest(high, widened(_mm512_extracti64x4_epi64(both, 1)));
+        Half* line = to + q * patch.row + p * patch.plane;
+        std::memset(line, 0, begin * sizeof(Half));
+        std::memset(line + end, 0, (patch.row - end) * sizeof(Half));
+      }
+    const float* from[S::Q];
+    __mmask16 there[S::Q];
+    for (int q = 0; q < S::Q; ++q) {
+      const int64_t r = y + (n * S::R + q) * part.every;
+      there[q] = r >= 0 && r < s.h ? 0xffff : 0;
+      from[q] = s.image + ((image * s.h + (there[q] ? r : 0)) * s.w + patch.x) * s.c;
+    }
+    for (int64_t k = begin; k < end; k += 2 * kTile) {
+      const __mmask16 lower = first(end - k), upper = first(end - k - kTile);
+      __m512 low[S::Q], high[S::Q];
+      for (int q = 0; q < S::Q; ++q) {
+        low[q] = _mm512_maskz_loadu_ps(lower & there[q], from[q] + k);
+        high[q] = _mm512_maskz_loadu_ps(upper & there[q], from[q] + k + kTile);
+      }
+      for (int q = 0; q < S::Q; ++q) {
+        __m512 a = combined(scheme.in[q], low), b = combined(scheme.in[q], high);
+        for (int p = 0; p < P; ++p) {
+          const __m512i both = (__m512i)_mm512_cvtne2ps_pbh(b, a);
+          const __mmask32 kept = static_cast<__mmask32>(upper) << 16 | lower;
+          _mm512_mask_storeu_epi16(to + q * patch.row + p * patch.plane + k, kept, both);
+          if (p + 1 < P) {
+            a = rest(a, widened(_mm512_castsi512_si256(both)));
+            b = rest(b, widened(_mm512_extracti64x4_epi64(both, 1)));
+          }
         }
       }
-    }
-    for (; k < end; k += kTile) {
-      __m256i parts[P];
-      split<P>(_mm512_maskz_loadu_ps(first(end - k), from + k), parts);
-      for (int p = 0; p < P; ++p)
-        _mm256_mask_storeu_epi16(to + p * patch.plane + k, first(end - k), parts[p]);
     }
   }
 }
@@ -207,11 +304,11 @@ inline void multiply() {
 
 // Small products first.
 template <int P, int M, int N>
-inline void add_taps(const Source& s, const Half* pixels, int64_t stride, const Patch& patch, const Half* kernels,
-                     int64_t next) {
+inline void add_lines(const Half* pixels, int64_t stride, const Patch& patch, const Half* kernels, int64_t next,
+                      int64_t lines, int64_t steps) {
   alignas(64) float unused[kTile * kTile];
-  for (int64_t y = 0; y < s.kh; ++y, pixels += patch.row)
-    for (int64_t k = 0; k < s.steps; ++k, kernels += P * kHalves) {
+  for (int64_t line = 0; line < lines; ++line, pixels += patch.row)
+    for (int64_t k = 0; k < steps; ++k, kernels += P * kHalves) {
       const Half* at = pixels + k * kDepth;
       if (P == 3) {
         load_pixels<M>(at + 2 * patch.plane, stride);
@@ -242,28 +339,34 @@ struct Place {
   int64_t image, i, j, y, x, t;  // i, j: parity; y, x: cell; t: first tile of outputs
 };
 
-template <int P, int M, int N>
-void add_block(const Job& job, const Patch* patches, const Place& at, float* sums) {
-  _tile_zero(0);
-  if (N > 1) _tile_zero(1);
-  if (M > 1) _tile_zero(2);
-  if (M > 1 && N > 1) _tile_zero(3);
-  for (size_t n = 0; n < job.sources.size(); ++n) {
-    const Source& s = job.sources[n];
-    const Patch& patch = patches[n];
-    const int64_t next = s.kh * s.steps * P * kHalves;
-    const int64_t parity = s.corners ? 2 * at.i + at.j : 0;
-    const int64_t y = s.corners ? at.y + at.i - 1 : at.y * job.step + at.i - s.kh / 2;
-    const int64_t x = s.corners ? at.x + at.j - 1 : at.x * job.step + at.j - s.kw / 2;
-    const Half* pixels = patch.data + (y - patch.y) * patch.row + (x - patch.x) * s.c;
-    add_taps<P, M, N>(s, pixels, s.corners ? s.c : job.step * s.c, patch,
-                      s.packed + (parity * job.tiles() + at.t) * next, next);
-  }
+constexpr int64_t kSums = 4 * kTile * kTile;  // of a line of a block
+
+// Of a block from the patches' line on.
+template <int P, int M, int N, class S>
+void add_block(const Job& job, const Patch* patches, int64_t line, const Place& at, float* sums) {
   constexpr int64_t kRow = 2 * kTile;
-  _tile_stored(0, sums, kRow * sizeof(float));
-  if (N > 1) _tile_stored(1, sums + kTile, kRow * sizeof(float));
-  if (M > 1) _tile_stored(2, sums + kTile * kRow, kRow * sizeof(float));
-  if (M > 1 && N > 1) _tile_stored(3, sums + kTile * kRow + kTile, kRow * sizeof(float));
+  for (int q = 0; q < S::Q; ++q, sums += kSums) {
+    _tile_zero(0);
+    if (N > 1) _tile_zero(1);
+    if (M > 1) _tile_zero(2);
+    if (M > 1 && N > 1) _tile_zero(3);
+    for (size_t n = 0; n < job.parts.size(); ++n) {
+      const Part& part = job.parts[n];
+      const Source& s = part.of;
+      const Patch& patch = patches[n];
+      const int64_t lines = part.lines<S>(), tile = part.steps * P * kHalves;
+      const int64_t parity = s.corners ? 2 * at.i + at.j : 0;
+      const int64_t x = s.corners ? at.x + at.j - 1 : at.x * job.step + at.j - s.kw / 2;
+      const Half* pixels = patch.data + (line + q) * patch.row + (x - patch.x) * s.c;
+      const Half* kernels = part.packed + ((parity * job.tiles() + at.t) * lines + q) * tile;
+      add_lines<P, M, N>(pixels, s.corners ? s.c : job.step * s.c, patch, kernels, lines * tile,
+                         S::kSummed ? lines : 1, part.steps);
+    }
+    _tile_stored(0, sums, kRow * sizeof(float));
+    if (N > 1) _tile_stored(1, sums + kTile, kRow * sizeof(float));
+    if (M > 1) _tile_stored(2, sums + kTile * kRow, kRow * sizeof(float));
+    if (M > 1 && N > 1) _tile_stored(3, sums + kTile * kRow + kTile, kRow * sizeof(float));
+  }
 }
 
 // Where values of a block pass, and as what.
@@ -272,8 +375,9 @@ struct Mask {
   const uint8_t* gate = nullptr;    // of its first pixel and output
   char bit = 1;
 
-  Mask(const Job& job, const Place& at) {
-    const int64_t y = at.y * job.step + at.i, x = at.x * job.step + at.j;
+  Mask() = default;
+  Mask(const Job& job, const Place& at, int64_t row) {
+    const int64_t y = (at.y + row) * job.step + at.i, x = at.x * job.step + at.j;
     if (job.inside) inside = job.inside + ((job.images > 1 ? at.image : 0) * job.H + y) * job.W + x;
     if (job.gate)
       gate = job.gate + ((at.image * (job.H / job.bits) + y / job.bits) * job.W + x) * job.outputs + at.t * kTile;
@@ -293,11 +397,12 @@ struct Mask {
   }
 };
 
-// Sums of a block to the output, through bias, ReLU, gate and bounds.
-void finish(const Job& job, const Place& at, const Mask& mask, int64_t pixels, const float* sums) {
+// Sums of a block to so many rows of the output, through bias, ReLU, gate and bounds.
+template <class S>
+void finish(const Job& job, const Place& at, const Mask* masks, int64_t rows, int64_t pixels, const float* sums) {
+  static constexpr S scheme{};
   const int64_t y = at.y * job.step + at.i, x = at.x * job.step + at.j, output = at.t * kTile;
   const int64_t pixel = (at.image * job.H + y) * job.W + x;
-  const __m128i bit = _mm_set1_epi8(mask.bit);
   const __m512 zero = _mm512_setzero_ps();
   for (int64_t half = 0; half < 2; ++half) {
     const __mmask16 wanted = first(job.outputs - output - half * kTile);
@@ -305,42 +410,54 @@ void finish(const Job& job, const Place& at, const Mask& mask, int64_t pixels, c
     const __m512 bias = job.bias ? _mm512_maskz_loadu_ps(wanted, job.bias + output + half * kTile) : zero;
     float* out = job.out + pixel * job.outputs + output + half * kTile;
     for (int64_t p = 0; p < pixels; ++p, out += job.step * job.outputs) {
-      __mmask16 passes = mask.inside && !mask.inside[p * job.step] ? 0 : 0xffff;
-      __m512 value = _mm512_add_ps(_mm512_load_ps(sums + p * 2 * kTile + half * kTile), bias);
-      // As a comparison with 0, so that NaN does not pass either.
-      if (job.relu) passes &= _mm512_cmp_ps_mask(value, zero, _CMP_GT_OQ);
-      if (mask.gate) {
-        const uint8_t* of = mask.gate + p * job.step * job.outputs + half * kTile;
-        passes &= _mm_test_epi8_mask(_mm_maskz_loadu_epi8(wanted, of), bit);
+      __m512 lines[S::Q];
+      for (int q = 0; q < S::Q; ++q) lines[q] = _mm512_load_ps(sums + q * kSums + p * 2 * kTile + half * kTile);
+#pragma GCC unroll 4
+      for (int r = 0; r < S::R; ++r) {
+        if (r >= rows) break;
+        const Mask& mask = masks[r];
+        __mmask16 passes = mask.inside && !mask.inside[p * job.step] ? 0 : 0xffff;
+        const __m512 value = _mm512_add_ps(combined(scheme.out[r], lines), bias);
+        // As a comparison with 0, so that NaN does not pass either.
+        if (job.relu) passes &= _mm512_cmp_ps_mask(value, zero, _CMP_GT_OQ);
+        if (mask.gate) {
+          const uint8_t* of = mask.gate + p * job.step * job.outputs + half * kTile;
+          passes &= _mm_test_epi8_mask(_mm_maskz_loadu_epi8(wanted, of), _mm_set1_epi8(mask.bit));
+        }
+        _mm512_mask_storeu_ps(out + r * job.step * job.W * job.outputs, wanted, _mm512_maskz_mov_ps(passes, value));
       }
-      _mm512_mask_storeu_ps(out, wanted, _mm512_maskz_mov_ps(passes, value));
     }
   }
 }
 
-void zero(const Job& job, const Place& at, int64_t pixels) {
-  const int64_t y = at.y * job.step + at.i, x = at.x * job.step + at.j, output = at.t * kTile;
-  float* out = job.out + ((at.image * job.H + y) * job.W + x) * job.outputs + output;
+void zero(const Job& job, const Place& at, int64_t rows, int64_t pixels) {
+  const int64_t x = at.x * job.step + at.j, output = at.t * kTile;
   const int64_t bytes = std::min(2 * kTile, job.outputs - output) * sizeof(float);
-  for (int64_t p = 0; p < pixels; ++p, out += job.step * job.outputs) std::memset(out, 0, bytes);
-}
-
-// What the sources have around those cells.
-template <int P>
-void gather_all(const Job& job, int64_t image, int64_t y0, int64_t y1, int64_t x0, int64_t x1, Memory* memory,
-                Patch* patches) {
-  for (size_t n = 0; n < job.sources.size(); ++n) {
-    const Source& s = job.sources[n];
-    const int64_t per = s.corners ? 1 : job.step, edge = s.corners ? 0 : 1;
-    patches[n].y = y0 * per - s.kh / 2;
-    patches[n].x = x0 * per - s.kw / 2;
-    gather<P>(s, image, (y1 - y0) * per + s.kh - edge, (x1 - x0) * per + s.kw - edge, memory[n], patches[n]);
+  for (int64_t r = 0; r < rows; ++r) {
+    const int64_t y = (at.y + r) * job.step + at.i;
+    float* out = job.out + ((at.image * job.H + y) * job.W + x) * job.outputs + output;
+    for (int64_t p = 0; p < pixels; ++p, out += job.step * job.outputs) std::memset(out, 0, bytes);
   }
 }
 
-template <int P>
+// What the parts have around those cells, for rows of that parity.
+template <int P, class S>
+void gather_all(const Job& job, const Place& at, int64_t y0, int64_t y1, int64_t x0, int64_t x1, Memory* memory,
+                Patch* patches) {
+  for (size_t n = 0; n < job.parts.size(); ++n) {
+    const Part& part = job.parts[n];
+    const Source& s = part.of;
+    const int64_t per = s.corners ? 1 : job.step, edge = s.corners ? 0 : 1;
+    const int64_t times = S::kSummed ? y1 - y0 + part.taps.size() - 1 : (y1 - y0 + S::R - 1) / S::R;
+    patches[n].x = x0 * per - s.kw / 2;
+    gather<P, S>(part, at.image, y0 * part.every + part.offset + at.i, times, (x1 - x0) * per + s.kw - edge,
+                 memory[n], patches[n]);
+  }
+}
+
+template <int P, class S>
 void task(const Job& job, int64_t index) {
-  thread_local Memory memory[2];
+  thread_local Memory memory[3];
   const int64_t h = job.H / job.step, w = job.W / job.step;
   const int64_t across = (w + job.columns - 1) / job.columns, down = (h + job.rows - 1) / job.rows;
   Place at;
@@ -349,28 +466,35 @@ void task(const Job& job, int64_t index) {
   const int64_t y1 = std::min(h, y0 + job.rows), x1 = std::min(w, x0 + job.columns);
   const Palette palette;
   _tile_loadconfig(&palette);
-  Patch patches[2];
-  bool gathered = false;
-  alignas(64) float sums[4 * kTile * kTile];
-  for (at.i = 0; at.i < job.step; ++at.i)
+  Patch patches[3];
+  alignas(64) float sums[S::Q * kSums];
+  for (at.i = 0; at.i < job.step; ++at.i) {
+    bool gathered = false;
     for (at.j = 0; at.j < job.step; ++at.j)
       for (at.t = 0; at.t < job.tiles(); at.t += 2)
-        for (at.y = y0; at.y < y1; ++at.y)
+        for (at.y = y0; at.y < y1; at.y += S::R)
           for (at.x = x0; at.x < x1; at.x += kPixels) {
-            const int64_t pixels = std::min(kPixels, x1 - at.x);
+            const int64_t pixels = std::min(kPixels, x1 - at.x), rows = std::min<int64_t>(S::R, y1 - at.y);
             const bool one = pixels <= kTile, last = job.tiles() - at.t == 1;
-            const Mask mask(job, at);
+            Mask masks[S::R];
+            bool any = false;
+            for (int64_t r = 0; r < rows; ++r) {
+              masks[r] = Mask(job, at, r);
+              any = any || masks[r].any(job, at, pixels);
+            }
             // Padding around an image is all zeros, and costs no more than writing them.
-            if (!mask.any(job, at, pixels)) {
-              zero(job, at, pixels);
+            if (!any) {
+              zero(job, at, rows, pixels);
               continue;
             }
-            if (!gathered) gather_all<P>(job, at.image, y0, y1, x0, x1, memory, patches);
+            if (!gathered) gather_all<P, S>(job, at, y0, y1, x0, x1, memory, patches);
             gathered = true;
-            (one ? last ? add_block<P, 1, 1> : add_block<P, 1, 2>
-                 : last ? add_block<P, 2, 1> : add_block<P, 2, 2>)(job, patches, at, sums);
-            finish(job, at, mask, pixels, sums);
+            const int64_t line = (at.y - y0) / S::R * S::Q;
+            (one ? last ? add_block<P, 1, 1, S> : add_block<P, 1, 2, S>
+                 : last ? add_block<P, 2, 1, S> : add_block<P, 2, 2, S>)(job, patches, line, at, sums);
+            finish<S>(job, at, masks, rows, pixels, sums);
           }
+  }
   _tile_release();
 }
 
@@ -403,24 +527,40 @@ void in_parallel(ffi::ThreadPool& pool, int64_t count, std::function<void(int64_
   tasks->all.wait(lock, [&] { return tasks->done == tasks->count; });
 }
 
-template <int P>
+template <int P, class S>
 void run(Job& job, ffi::ThreadPool& pool) {
-  for (Source& s : job.sources) pack<P>(job, s);
+  for (Part& part : job.parts) pack<P, S>(job, part);
   job.rows = kTile / job.step;
   job.columns = 4 * kPixels;
   auto bytes = [&] {
     int64_t total = 0;
-    for (const Source& s : job.sources) {
-      const int64_t per = s.corners ? 1 : job.step;
-      total += (job.rows * per + s.kh) * (job.columns * per + s.kw) * s.c * P * sizeof(Half);
+    for (const Part& part : job.parts) {
+      const Source& s = part.of;
+      const int64_t lines = S::kSummed ? job.rows + part.taps.size() - 1 : job.rows / S::R * S::Q;
+      total += lines * (job.columns * (s.corners ? 1 : job.step) + s.kw) * s.c * P * sizeof(Half);
     }
     return total;
   };
   while (job.columns > kPixels && bytes() > kPatch) job.columns /= 2;
-  while (job.rows > 1 && bytes() > kPatch) job.rows /= 2;
+  while (job.rows > S::R && bytes() > kPatch) job.rows /= 2;
   const int64_t h = job.H / job.step, w = job.W / job.step;
   const int64_t count = job.n * ((h + job.rows - 1) / job.rows) * ((w + job.columns - 1) / job.columns);
-  in_parallel(pool, count, [&job](int64_t index) { task<P>(job, index); });
+  in_parallel(pool, count, [&job](int64_t index) { task<P, S>(job, index); });
+}
+
+// By lines where that saves products, and a row of taps is long enough for it: of short ones sums round little.
+void run_in_float32(Job& job, ffi::ThreadPool& pool) {
+  auto all = [&](size_t least, size_t most) {
+    return std::all_of(job.parts.begin(), job.parts.end(), [&](const Part& part) {
+      return part.taps.size() >= least && part.taps.size() <= most;
+    });
+  };
+  const bool is_long = std::any_of(job.parts.begin(), job.parts.end(),
+                                   [](const Part& part) { return part.of.kw * part.of.c > kDepth; });
+  if (is_long && job.step == 2 && all(1, 2)) return run<3, Toom42>(job, pool);
+  if (is_long && job.step == 1 && all(3, 3)) return run<3, Toom43>(job, pool);
+  if (is_long && job.step == 1 && all(5, 5)) return run<3, Toom25>(job, pool);
+  run<3, Direct>(job, pool);
 }
 
 // A large output's first touch otherwise takes as long as a small convolution, a page of 4 KiB at a time.
@@ -446,11 +586,16 @@ ffi::Error convolve(ffi::ThreadPool pool, Floats low, Floats low_kernel, Floats 
   auto add = [&](const Floats& of, const Floats& by, bool corners) {
     if (!of.element_count()) return;
     const auto d = of.dimensions(), k = by.dimensions();
-    Source s{of.typed_data(), d[1], d[2], d[3], by.typed_data(), k[0], k[1], corners};
-    job.sources.push_back(std::move(s));
+    const Source s{of.typed_data(), d[1], d[2], d[3], by.typed_data(), k[0], k[1], corners};
+    const int64_t every = corners ? 1 : job.step;
+    for (int64_t begin = 0; begin < std::min(every, k[0]); ++begin) {
+      Part part{s, every, begin - k[0] / 2, {}};
+      for (int64_t row = begin; row < k[0]; row += every) part.taps.push_back(row);
+      job.parts.push_back(std::move(part));
+    }
   };
   add(low, low_kernel, true);
-  if (!job.sources.empty()) job.step = 2;
+  if (!job.parts.empty()) job.step = 2;
   add(image, kernel, false);
   if (bias.element_count()) job.bias = bias.typed_data();
   if (gate.element_count()) job.gate = gate.typed_data();
@@ -458,7 +603,7 @@ ffi::Error convolve(ffi::ThreadPool pool, Floats low, Floats low_kernel, Floats 
   job.bits = bits, job.relu = relu;
   if (!out->element_count()) return ffi::Error::Success();
   ask_for_huge_pages(job.out, out->size_bytes());
-  planes == 1 ? run<1>(job, pool) : planes == 2 ? run<2>(job, pool) : run<3>(job, pool);
+  planes == 1 ? run<1, Direct>(job, pool) : planes == 2 ? run<2, Direct>(job, pool) : run_in_float32(job, pool);
   return ffi::Error::Success();
 } catch (const std::exception& error) {
   return ffi::Error(ffi::ErrorCode::kResourceExhausted, error.what());
