@@ -578,7 +578,7 @@ using Bytes = ffi::Buffer<ffi::U8>;
 // parities; image: n, H, W, c and its kernel kh, kw, c, outputs.
 ffi::Error convolve(ffi::ThreadPool pool, Floats low, Floats low_kernel, Floats image, Floats kernel, Floats bias,
                     Bytes gate, Bytes inside, ffi::ResultBuffer<ffi::F32> out, int64_t planes, int64_t bits,
-                    bool relu) try {
+                    bool relu, bool by_rows) try {
   Job job;
   const auto o = out->dimensions();
   job.n = o[0], job.H = o[1], job.W = o[2], job.outputs = o[3];
@@ -603,7 +603,8 @@ ffi::Error convolve(ffi::ThreadPool pool, Floats low, Floats low_kernel, Floats 
   job.bits = bits, job.relu = relu;
   if (!out->element_count()) return ffi::Error::Success();
   ask_for_huge_pages(job.out, out->size_bytes());
-  planes == 1 ? run<1, Direct>(job, pool) : planes == 2 ? run<2, Direct>(job, pool) : run_in_float32(job, pool);
+  if (planes == 3 && !by_rows) run_in_float32(job, pool);
+  else planes == 1 ? run<1, Direct>(job, pool) : planes == 2 ? run<2, Direct>(job, pool) : run<3, Direct>(job, pool);
   return ffi::Error::Success();
 } catch (const std::exception& error) {
   return ffi::Error(ffi::ErrorCode::kResourceExhausted, error.what());
@@ -624,7 +625,8 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(progden_convolve, convolve,
                                   .Ret<Floats>()
                                   .Attr<int64_t>("planes")
                                   .Attr<int64_t>("bits")
-                                  .Attr<bool>("relu"));
+                                  .Attr<bool>("relu")
+                                  .Attr<bool>("by_rows"));
 
 // Whether the system lets this process use AMX: Linux gives its registers to those that ask.
 extern "C" int progden_asks_for_amx() {

@@ -40,6 +40,7 @@ def convolution(
     bits: int = 1,
     inside: UInt8[Array, "#n h2 w2"] | None = None,
     relu: bool = False,
+    by_rows: bool = False,
 ) -> Float[Array, "n h2 w2 co"]:
     """The convolution of `image` with zeros around it, and of `low` with each pixel repeated over 2×2.
 
@@ -55,6 +56,7 @@ def convolution(
     gate : zeros where it has no bit: bit r of row i is for row ``bits * i + r``.
     inside : zeros where it is 0.
     relu : zeros where the sum is not above 0.
+    by_rows : multiply by every tap, where else rows are summed first; with three planes only.
     """
     some, by = (low, folded) if image is None else (image, kernel)
     if some is None or by is None:
@@ -70,12 +72,16 @@ def convolution(
         planes=planes,
         bits=bits,
         relu=relu,
+        by_rows=by_rows,
     )
 
 
-def _call(*operands: Array, shape: Sequence[int], planes: int, bits: int, relu: bool) -> Array:
+def _call(
+    *operands: Array, shape: Sequence[int], planes: int, bits: int, relu: bool, by_rows: bool
+) -> Array:
     call = jax.ffi.ffi_call(_amx.TARGET, jax.ShapeDtypeStruct(tuple(shape), jnp.float32))
-    return call(*operands, planes=np.int64(planes), bits=np.int64(bits), relu=np.bool_(relu))
+    settings = {"relu": np.bool_(relu), "by_rows": np.bool_(by_rows)}
+    return call(*operands, planes=np.int64(planes), bits=np.int64(bits), **settings)
 
 
 @functools.cache
@@ -103,6 +109,7 @@ def _jvp(operands: Sequence[Array], tangents: Sequence[Any], **settings: Any) ->
                 gate=gate if gate.size else None,
                 bits=bits,
                 inside=inside if inside.size else None,
+                by_rows=settings["by_rows"],
             )
         )
     by_weights = []
@@ -124,7 +131,15 @@ def _where(gate: Array, inside: Array, value: Array, bits: int) -> Array:
     return jnp.where(inside[..., None] != 0, value, own_zero(value)) if inside.size else value
 
 
-def _transposed(cotangent: Any, *operands: Any, shape: Any, planes: int, bits: int, relu: bool):
+def _transposed(
+    cotangent: Any,
+    *operands: Any,
+    shape: Any,
+    planes: int,
+    bits: int,
+    relu: bool,
+    by_rows: bool,
+) -> list[Any]:
     _, folded, _, kernel, bias, gate, inside = operands
     if relu or bias.size:
         raise NotImplementedError("a convolution with a ReLU or a bias is not linear.")
@@ -145,7 +160,7 @@ def _transposed(cotangent: Any, *operands: Any, shape: Any, planes: int, bits: i
             )(cotangent)[0]
         else:
             turned = kernel[::-1, ::-1].swapaxes(2, 3)
-            found[i] = convolution(None, None, cotangent, turned, planes=planes)
+            found[i] = convolution(None, None, cotangent, turned, planes=planes, by_rows=by_rows)
     return found
 
 

@@ -66,6 +66,11 @@ def test_convolution(size, channels, outputs, edge):
         found = _amx_convolution.convolution(None, None, image, kernel, planes=planes)
         assert off(found, expected) < bound
     assert off(found, expected) < 2 * off(plain(image, kernel), expected)
+    by_rows = _amx_convolution.convolution(None, None, image, kernel, planes=3, by_rows=True)
+    assert off(by_rows, expected) < 2 * off(plain(image, kernel), expected)
+    # Rows are summed first where kernels have three or five, each longer than a step of the units.
+    same = edge not in (3, 5) or edge * channels <= 32
+    assert (np.asarray(by_rows) == np.asarray(found)).all() == same
 
 
 def plain(image, kernel):

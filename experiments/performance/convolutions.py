@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from experiments import _common
 from experiments.performance.step import seconds
 from progden_jax import _amx
-from progden_jax._convolution import same_convolution
+from progden_jax._amx_convolution import convolution
 
 INPUT = (
     (4, 0, -5, 0, 1, 0),
@@ -94,10 +94,10 @@ def _combined(matrix: Sequence[Sequence[float]], values: Sequence[Array]) -> lis
 
 
 def by_amx(
-    image: Float[Array, "h w c"], kernel: Float[Array, "3 3 c k"], *, precision: str
+    image: Float[Array, "h w c"], kernel: Float[Array, "3 3 c k"], *, planes: int, by_rows: bool
 ) -> Float[Array, "h w k"]:
-    """The library's own, of so many bfloat16 a value."""
-    return same_convolution(image[None], kernel, precision)[0]
+    """The library's own, of so many bfloat16 a value; every product, or of sums of rows."""
+    return convolution(None, None, image[None], kernel, planes=planes, by_rows=by_rows)[0]
 
 
 def as_product(columns: Float[Array, "n 9c"], kernel: Float[Array, "9c k"]) -> Float[Array, "n k"]:
@@ -118,18 +118,15 @@ def programs(size: int, channels: int, outputs: int) -> dict[str, tuple[Callable
         **{f"direct, by {name}": (direct, (image, kernel), o) for name, o in SWITCHES.items()},
         "Winograd": (winograd, (image, transformed(kernel)), {}),
         "direct, bfloat16": (direct, half, {}),
-        **(
-            {
-                f"AMX, {_amx.planes(precision, kernel)} bfloat16 a value": (
-                    functools.partial(by_amx, precision=precision),
-                    (image, kernel),
-                    {},
-                )
-                for precision in ("highest", "high", "bfloat16")
-            }
+        **{
+            f"AMX, {planes} bfloat16 a value{', by rows' * by_rows}": (
+                functools.partial(by_amx, planes=planes, by_rows=by_rows),
+                (image, kernel),
+                {},
+            )
+            for planes, by_rows in ((3, True), (3, False), (2, False), (1, False))
             if _amx.planes("highest", kernel)
-            else {}
-        ),
+        },
         "product alone": (as_product, (columns, flat), {}),
         "product alone, bfloat16": (
             as_product,

@@ -301,7 +301,7 @@ def tables(rows: Sequence[Row], off: Sequence[Error], found: Sequence[Process]) 
         ),
         f"The convolution for the operations ran at a median of "
         f"{statistics.median(r.limit_gflops for r in rows):.0f} GFLOP/s, by "
-        f"{'AMX' if _amx.available() else 'XLA'}.",
+        f"{'AMX, row by row' if _amx.available() else 'XLA'}.",
     ]
     if off:
         header = ("size", "program", "probes", "ms", "error of the divergence", "RMSE of the image")

@@ -19,8 +19,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import progden_jax as pd
 from experiments import _common
-from progden_jax import mixers
-from progden_jax._convolution import same_convolution
+from progden_jax import _amx, mixers
+from progden_jax._amx_convolution import convolution as amx_convolution
 from progden_jax._devices import cores_as_devices
 from progden_jax.training import MixerConfig, MixerTask, config
 from progden_jax.training.step import make_start, make_step
@@ -37,7 +37,8 @@ def operations(params: Any, pixels: int) -> float:
 def convolution(
     batch: int, size: int, channels: int, *, by_xla: bool
 ) -> tuple[Any, tuple[Any, ...], float]:
-    """A 3×3 convolution in float32, its arguments and its operations: XLA's own, or the fastest at hand.
+    """A 3×3 convolution in float32, its arguments and its operations: XLA's own, or the fastest at hand that
+    does them all.
 
     Of random values, as a network's are: matrix units run an eighth faster on constants.
     """
@@ -47,8 +48,8 @@ def convolution(
 
     @jax.jit
     def run(image: jax.Array, kernel: jax.Array) -> jax.Array:
-        if not by_xla:
-            return same_convolution(image, kernel, "highest")
+        if not by_xla and (planes := _amx.planes("highest", kernel, image)):
+            return amx_convolution(None, None, image, kernel, planes=planes, by_rows=True)
         return jax.lax.conv_general_dilated(
             image, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
         )
