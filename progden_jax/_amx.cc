@@ -129,10 +129,13 @@ struct Toom {
   }
 };
 
-constexpr double kFive[] = {0, 1, -2, -0.5}, kSix[] = {0, 1.5, -1.5, 2. / 3, -2. / 3};
+constexpr double kThree[] = {0, 1}, kFour[] = {0, 1, -1}, kFive[] = {0, 1, -2, -0.5};
+constexpr double kSix[] = {0, 1.5, -1.5, 2. / 3, -2. / 3};
 struct Toom43 : Toom<4, 3> { constexpr Toom43() : Toom(kSix) {} };
 struct Toom25 : Toom<2, 5> { constexpr Toom25() : Toom(kSix) {} };
+struct Toom23 : Toom<2, 3> { constexpr Toom23() : Toom(kFour) {} };
 struct Toom42 : Toom<4, 2> { constexpr Toom42() : Toom(kFive) {} };
+struct Toom22 : Toom<2, 2> { constexpr Toom22() : Toom(kThree) {} };
 
 // Row by row, for any kernel: lines are rows, and what belongs to one row of outputs is summed.
 struct Direct {
@@ -548,8 +551,8 @@ void run(Job& job, ffi::ThreadPool& pool) {
   in_parallel(pool, count, [&job](int64_t index) { task<P, S>(job, index); });
 }
 
-// By lines where that saves products, and a row of taps is long enough for it: of short ones sums round little.
-void run_in_float32(Job& job, ffi::ThreadPool& pool) {
+// By lines of at most so many rows of outputs, where a row of taps is long enough: of short ones sums round little.
+void run_in_float32(Job& job, ffi::ThreadPool& pool, int64_t together) {
   auto all = [&](size_t least, size_t most) {
     return std::all_of(job.parts.begin(), job.parts.end(), [&](const Part& part) {
       return part.taps.size() >= least && part.taps.size() <= most;
@@ -557,9 +560,12 @@ void run_in_float32(Job& job, ffi::ThreadPool& pool) {
   };
   const bool is_long = std::any_of(job.parts.begin(), job.parts.end(),
                                    [](const Part& part) { return part.of.kw * part.of.c > kDepth; });
-  if (is_long && job.step == 2 && all(1, 2)) return run<3, Toom42>(job, pool);
-  if (is_long && job.step == 1 && all(3, 3)) return run<3, Toom43>(job, pool);
-  if (is_long && job.step == 1 && all(5, 5)) return run<3, Toom25>(job, pool);
+  const int64_t rows = is_long ? together / job.step : 1;
+  if (rows >= 2 && job.step == 2 && all(1, 2))
+    return rows >= 4 ? run<3, Toom42>(job, pool) : run<3, Toom22>(job, pool);
+  if (rows >= 2 && job.step == 1 && all(3, 3))
+    return rows >= 4 ? run<3, Toom43>(job, pool) : run<3, Toom23>(job, pool);
+  if (rows >= 2 && job.step == 1 && all(5, 5)) return run<3, Toom25>(job, pool);
   run<3, Direct>(job, pool);
 }
 
@@ -578,7 +584,7 @@ using Bytes = ffi::Buffer<ffi::U8>;
 // parities; image: n, H, W, c and its kernel kh, kw, c, outputs.
 ffi::Error convolve(ffi::ThreadPool pool, Floats low, Floats low_kernel, Floats image, Floats kernel, Floats bias,
                     Bytes gate, Bytes inside, ffi::ResultBuffer<ffi::F32> out, int64_t planes, int64_t bits,
-                    bool relu, bool by_rows) try {
+                    bool relu, int64_t together) try {
   Job job;
   const auto o = out->dimensions();
   job.n = o[0], job.H = o[1], job.W = o[2], job.outputs = o[3];
@@ -603,8 +609,9 @@ ffi::Error convolve(ffi::ThreadPool pool, Floats low, Floats low_kernel, Floats 
   job.bits = bits, job.relu = relu;
   if (!out->element_count()) return ffi::Error::Success();
   ask_for_huge_pages(job.out, out->size_bytes());
-  if (planes == 3 && !by_rows) run_in_float32(job, pool);
-  else planes == 1 ? run<1, Direct>(job, pool) : planes == 2 ? run<2, Direct>(job, pool) : run<3, Direct>(job, pool);
+  planes == 1   ? run<1, Direct>(job, pool)
+  : planes == 2 ? run<2, Direct>(job, pool)
+                : run_in_float32(job, pool, together);
   return ffi::Error::Success();
 } catch (const std::exception& error) {
   return ffi::Error(ffi::ErrorCode::kResourceExhausted, error.what());
@@ -626,7 +633,7 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(progden_convolve, convolve,
                                   .Attr<int64_t>("planes")
                                   .Attr<int64_t>("bits")
                                   .Attr<bool>("relu")
-                                  .Attr<bool>("by_rows"));
+                                  .Attr<int64_t>("together"));
 
 // Whether the system lets this process use AMX: Linux gives its registers to those that ask.
 extern "C" int progden_asks_for_amx() {

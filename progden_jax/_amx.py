@@ -39,6 +39,10 @@ _PATIENCE = 120.0
 _PLANES = {"bfloat16": 1, "high": 2, "tensorfloat32": 2}
 """Precision -> how many bfloat16 stand for a value: relative errors of 2e-3, 4e-6, and 2e-7 with three."""
 
+ALIGNED = 8
+"""Rows at whose multiples bands begin, and tiles of networks that pool thrice or more. Only within them rows
+are computed together, so that a pixel gets the same bits in each."""
+
 _FEWEST = 512
 """Weights of a kernel below which its tiles would be mostly empty."""
 

@@ -40,7 +40,7 @@ def convolution(
     bits: int = 1,
     inside: UInt8[Array, "#n h2 w2"] | None = None,
     relu: bool = False,
-    by_rows: bool = False,
+    together: int = _amx.ALIGNED,
 ) -> Float[Array, "n h2 w2 co"]:
     """The convolution of `image` with zeros around it, and of `low` with each pixel repeated over 2×2.
 
@@ -56,7 +56,8 @@ def convolution(
     gate : zeros where it has no bit: bit r of row i is for row ``bits * i + r``.
     inside : zeros where it is 0.
     relu : zeros where the sum is not above 0.
-    by_rows : multiply by every tap, where else rows are summed first; with three planes only.
+    together : rows that may be computed together, with sums of them multiplied in place of each; only three
+        planes are. Parts of an image get the same bits where they begin at multiples of so many rows.
     """
     some, by = (low, folded) if image is None else (image, kernel)
     if some is None or by is None:
@@ -72,16 +73,15 @@ def convolution(
         planes=planes,
         bits=bits,
         relu=relu,
-        by_rows=by_rows,
+        together=together,
     )
 
 
-def _call(
-    *operands: Array, shape: Sequence[int], planes: int, bits: int, relu: bool, by_rows: bool
-) -> Array:
+def _call(*operands: Array, shape: Sequence[int], relu: bool, **numbers: int) -> Array:
     call = jax.ffi.ffi_call(_amx.TARGET, jax.ShapeDtypeStruct(tuple(shape), jnp.float32))
-    settings = {"relu": np.bool_(relu), "by_rows": np.bool_(by_rows)}
-    return call(*operands, planes=np.int64(planes), bits=np.int64(bits), **settings)
+    return call(
+        *operands, relu=np.bool_(relu), **{name: np.int64(n) for name, n in numbers.items()}
+    )
 
 
 @functools.cache
@@ -109,7 +109,7 @@ def _jvp(operands: Sequence[Array], tangents: Sequence[Any], **settings: Any) ->
                 gate=gate if gate.size else None,
                 bits=bits,
                 inside=inside if inside.size else None,
-                by_rows=settings["by_rows"],
+                together=settings["together"],
             )
         )
     by_weights = []
@@ -138,7 +138,7 @@ def _transposed(
     planes: int,
     bits: int,
     relu: bool,
-    by_rows: bool,
+    together: int,
 ) -> list[Any]:
     _, folded, _, kernel, bias, gate, inside = operands
     if relu or bias.size:
@@ -160,7 +160,7 @@ def _transposed(
             )(cotangent)[0]
         else:
             turned = kernel[::-1, ::-1].swapaxes(2, 3)
-            found[i] = convolution(None, None, cotangent, turned, planes=planes, by_rows=by_rows)
+            found[i] = convolution(None, None, cotangent, turned, planes=planes, together=together)
     return found
 
 

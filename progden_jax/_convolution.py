@@ -40,12 +40,12 @@ _VECTOR = 4
 """Eigen, which convolves on CPUs, gathers a kernel's inputs in vectors only if these divide the channels."""
 
 
-def _convolve(inputs: Array, kernel: Array, precision: Any) -> Array:
+def _convolve(inputs: Array, kernel: Array, precision: Any, together: int = _amx.ALIGNED) -> Array:
     missing = -inputs.shape[-1] % _VECTOR
     if kernel.shape[:2] == (1, 1):
         return jnp.matmul(inputs, kernel[0, 0], precision=_of_products(precision))
     if planes := _amx.planes(precision, kernel, inputs):
-        return convolution(None, None, inputs, kernel, planes=planes)
+        return convolution(None, None, inputs, kernel, planes=planes, together=together)
     if precision == "bfloat16":
         return lax.conv_general_dilated(
             *(inputs.astype(jnp.bfloat16), kernel.astype(jnp.bfloat16), (1, 1), "SAME"),
@@ -60,29 +60,32 @@ def _convolve(inputs: Array, kernel: Array, precision: Any) -> Array:
     )
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
+@functools.partial(jax.custom_jvp, nondiff_argnums=(2, 3))
 def same_convolution(
     inputs: Float[Array, "n h w ci"],
     kernel: Float[Array, "kh kw ci co"],
     precision: lax.PrecisionLike = None,
+    together: int = _amx.ALIGNED,
 ) -> Float[Array, "n h w co"]:
     """Convolution with zero padding to the same size; kernel sides must be odd.
+
+    Parts of an image get the same bits where they begin at multiples of `together` rows.
 
     XLA makes the derivative by the kernel a convolution with a kernel as large as the image, which runs on
     CPUs at a fifth to a tenth of the forward pass's speed. There it is matrix products here.
     """
-    return _convolve(inputs, kernel, precision)
+    return _convolve(inputs, kernel, precision, together)
 
 
 @functools.partial(same_convolution.defjvp, symbolic_zeros=True)
 def _jvp(
-    precision: Any, primals: tuple[Array, Array], tangents: tuple[Any, Any]
+    precision: Any, together: int, primals: tuple[Array, Array], tangents: tuple[Any, Any]
 ) -> tuple[Array, Array]:
     (inputs, kernel), (by_inputs, by_kernel) = primals, tangents
-    out = same_convolution(inputs, kernel, precision)
+    out = same_convolution(inputs, kernel, precision, together)
     slopes = []
     if not isinstance(by_inputs, SymbolicZero):
-        slopes.append(same_convolution(by_inputs, kernel, precision))
+        slopes.append(same_convolution(by_inputs, kernel, precision, together))
     if not isinstance(by_kernel, SymbolicZero):
         along = by_products if jax.default_backend() == "cpu" else _convolve
         slopes.append(along(inputs, by_kernel, _of_products(precision)))
@@ -143,12 +146,13 @@ _FEW = 4
 the output takes no memory of its own."""
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
+@functools.partial(jax.custom_jvp, nondiff_argnums=(3, 4))
 def upsampled_convolution(
     low: Float[Array, "n h w ci"],
     skip: Float[Array, "n 2h 2w cs"],
     kernel: Float[Array, "3 3 ci+cs co"],
     precision: lax.PrecisionLike = None,
+    together: int = _amx.ALIGNED,
 ) -> Float[Array, "n 2h 2w co"]:
     """`same_convolution` of `low`, each pixel repeated over 2×2, beside `skip`, in fewer operations.
 
@@ -160,7 +164,7 @@ def upsampled_convolution(
     beside = skip.shape[-1]
     if planes := _amx.planes(precision, kernel, low, skip):
         fine = (skip, rest) if beside else (None, None)
-        return convolution(low, weights, *fine, planes=planes)
+        return convolution(low, weights, *fine, planes=planes, together=together)
     joined = 0 < beside <= _FEW
     if joined:
         n, h, w, _ = low.shape
@@ -169,16 +173,19 @@ def upsampled_convolution(
         weights = jnp.concatenate([weights, of_cells(rest)], axis=2)
     out = corners(low, weights, precision)
     if beside and not joined:
-        out = out + same_convolution(skip, rest, precision)
+        out = out + same_convolution(skip, rest, precision, together)
     return out
 
 
 @functools.partial(upsampled_convolution.defjvp, symbolic_zeros=True)
 def _upsampled_jvp(
-    precision: Any, primals: tuple[Array, Array, Array], tangents: tuple[Any, Any, Any]
+    precision: Any,
+    together: int,
+    primals: tuple[Array, Array, Array],
+    tangents: tuple[Any, Any, Any],
 ) -> tuple[Array, Array]:
     (low, skip, kernel), (by_low, by_skip, by_kernel) = primals, tangents
-    out = upsampled_convolution(low, skip, kernel, precision)
+    out = upsampled_convolution(low, skip, kernel, precision, together)
     slopes = []
     channels = low.shape[-1]
     if not isinstance(by_low, SymbolicZero):
@@ -186,9 +193,9 @@ def _upsampled_jvp(
             skip_slope, taken = skip[..., :0], kernel[:, :, :channels]
         else:
             skip_slope, taken = by_skip, kernel
-        slopes.append(upsampled_convolution(by_low, skip_slope, taken, precision))
+        slopes.append(upsampled_convolution(by_low, skip_slope, taken, precision, together))
     elif not isinstance(by_skip, SymbolicZero):
-        slopes.append(same_convolution(by_skip, kernel[:, :, channels:], precision))
+        slopes.append(same_convolution(by_skip, kernel[:, :, channels:], precision, together))
     if not isinstance(by_kernel, SymbolicZero):
         both = jnp.concatenate([repeated(low), skip], axis=-1)
         slopes.append(by_products(both, by_kernel, _of_products(precision)))

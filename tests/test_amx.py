@@ -66,7 +66,7 @@ def test_convolution(size, channels, outputs, edge):
         found = _amx_convolution.convolution(None, None, image, kernel, planes=planes)
         assert off(found, expected) < bound
     assert off(found, expected) < 2 * off(plain(image, kernel), expected)
-    by_rows = _amx_convolution.convolution(None, None, image, kernel, planes=3, by_rows=True)
+    by_rows = _amx_convolution.convolution(None, None, image, kernel, planes=3, together=1)
     assert off(by_rows, expected) < 2 * off(plain(image, kernel), expected)
     # Rows are summed first where kernels have three or five, each longer than a step of the units.
     same = edge not in (3, 5) or edge * channels <= 32
@@ -151,19 +151,27 @@ def test_few_weights_are_left_to_xla(precision):
 
 
 @needs_amx
-@pytest.mark.parametrize(("edge", "precision"), [(3, "highest"), (5, "highest"), (3, "high")])
-def test_a_part_is_the_same_bits(edge, precision):
-    """What a pixel gets hangs neither on the size of the image nor, every fourth row, on where it lies."""
+@pytest.mark.parametrize("together", [1, 2, 4, 8])
+@pytest.mark.parametrize("form", ["3×3", "5×5", "upsampled"])
+def test_a_part_is_the_same_bits(form, together):
+    """Where it begins at rows that fit, a pixel gets what it gets in the whole image."""
     rng = np.random.default_rng(3)
-    image, kernel = drawn(rng, 1, 60, 150, 24), drawn(rng, edge, edge, 24, 40)
-    whole = same_convolution(image, kernel, precision)
-    for first in (8, 7):
-        part = same_convolution(image[:, first : first + 33, 50:120], kernel, precision)
-        found, expected = part[:, 2:-2, 2:-2], whole[:, first + 2 : first + 31, 52:118]
-        if first % 4 == 0 or precision == "high":
-            np.testing.assert_array_equal(found, expected)
-        # Rows that are computed together, and so their rounding, are others.
-        assert off(found, np.asarray(expected, np.float64)) < 5e-7
+    edge = 5 if form == "5×5" else 3
+    low, image = drawn(rng, 1, 35, 75, 24), drawn(rng, 1, 70, 150, 24)
+    kernel = drawn(rng, edge, edge, 48 if form == "upsampled" else 24, 40)
+
+    def convolved(rows, columns):
+        part = image[:, slice(*rows), slice(*columns)]
+        if form != "upsampled":
+            return same_convolution(part, kernel, "highest", together)
+        halves = (slice(*(n // 2 for n in ends)) for ends in (rows, columns))
+        return upsampled_convolution(low[:, *halves], part, kernel, "highest", together)
+
+    whole = convolved((0, 70), (0, 150))
+    for first in (max(together, 2), 3 * max(together, 2)):
+        part = convolved((first, first + 34), (50, 120))
+        expected = whole[:, first + 2 : first + 32, 52:118]
+        np.testing.assert_array_equal(part[:, 2:-2, 2:-2], expected)
 
 
 def layer_and_images(rng):
@@ -179,9 +187,9 @@ def test_derivatives_of_a_rectified_convolution(upsampled):
 
     def joined(layer, low, image):
         if upsampled:
-            return layers.convolve_rectified(layer, low, [image], inside, "highest")
+            return layers.convolve_rectified(layer, low, [image], inside, "highest", 0)
         wide = jnp.repeat(jnp.repeat(low, 2, 0), 2, 1)
-        return layers.convolve_rectified(layer, None, [wide, image], inside, "highest")
+        return layers.convolve_rectified(layer, None, [wide, image], inside, "highest", 0)
 
     def by_xla(layer, low, image):
         both = jnp.concatenate([jnp.repeat(jnp.repeat(low, 2, 0), 2, 1), image], -1)

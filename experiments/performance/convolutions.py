@@ -94,10 +94,10 @@ def _combined(matrix: Sequence[Sequence[float]], values: Sequence[Array]) -> lis
 
 
 def by_amx(
-    image: Float[Array, "h w c"], kernel: Float[Array, "3 3 c k"], *, planes: int, by_rows: bool
+    image: Float[Array, "h w c"], kernel: Float[Array, "3 3 c k"], *, planes: int, together: int
 ) -> Float[Array, "h w k"]:
     """The library's own, of so many bfloat16 a value; every product, or of sums of rows."""
-    return convolution(None, None, image[None], kernel, planes=planes, by_rows=by_rows)[0]
+    return convolution(None, None, image[None], kernel, planes=planes, together=together)[0]
 
 
 def as_product(columns: Float[Array, "n 9c"], kernel: Float[Array, "9c k"]) -> Float[Array, "n k"]:
@@ -119,12 +119,12 @@ def programs(size: int, channels: int, outputs: int) -> dict[str, tuple[Callable
         "Winograd": (winograd, (image, transformed(kernel)), {}),
         "direct, bfloat16": (direct, half, {}),
         **{
-            f"AMX, {planes} bfloat16 a value{', by rows' * by_rows}": (
-                functools.partial(by_amx, planes=planes, by_rows=by_rows),
+            f"AMX, {planes} bfloat16 a value{', row by row' * (planes == 3 and together == 1)}": (
+                functools.partial(by_amx, planes=planes, together=together),
                 (image, kernel),
                 {},
             )
-            for planes, by_rows in ((3, True), (3, False), (2, False), (1, False))
+            for planes, together in ((3, 1), (3, _amx.ALIGNED), (2, 1), (1, 1))
             if _amx.planes("highest", kernel)
         },
         "product alone": (as_product, (columns, flat), {}),

@@ -49,7 +49,7 @@ def convolution(
     @jax.jit
     def run(image: jax.Array, kernel: jax.Array) -> jax.Array:
         if not by_xla and (planes := _amx.planes("highest", kernel, image)):
-            return amx_convolution(None, None, image, kernel, planes=planes, by_rows=True)
+            return amx_convolution(None, None, image, kernel, planes=planes, together=1)
         return jax.lax.conv_general_dilated(
             image, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
         )

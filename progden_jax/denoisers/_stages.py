@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from progden_jax._bands import in_bands, rows_of
 from progden_jax.denoisers import graph
+from progden_jax.denoisers.layers import rows_together
 from progden_jax.denoisers.nodes import BatchNorm, Conv, Filter, MaxPool, Node, Upsample, sources
 
 _LEVELS = 2
@@ -62,8 +63,8 @@ def evaluate(
             inputs.shape[0] >> finest,
             rows=rows >> finest if finest < _LEVELS else inputs.shape[0],
             halo=sum(_radius(nodes[i], params) << (strides[i] - finest) for i in which),
-            # Masks are kept as bits, of eight rows side by side.
-            multiple=max(4, 1 << (coarsest - finest)),
+            # Masks are kept as bits, of four or eight rows side by side.
+            multiple=max(4, rows_together(finest), 1 << (coarsest - finest)),
         )
     return values[len(nodes) - 1]
 

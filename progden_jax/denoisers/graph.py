@@ -270,9 +270,9 @@ def evaluate_part(
                 layer = params[node.layer]
                 low, others = read(node)
                 if low is None:
-                    value = convolve(layer, jnp.concatenate(others, axis=-1), precision)
+                    value = convolve(layer, jnp.concatenate(others, axis=-1), precision, level)
                 else:
-                    value = convolve_upsampled(layer, low, others, precision)
+                    value = convolve_upsampled(layer, low, others, precision, level)
                 if index in bare:
                     extent = jnp.ones((*value.shape[:2], 1), bool)
                     kept[index] = extent if masks is None else masks[level]
@@ -280,7 +280,9 @@ def evaluate_part(
             case Relu() if node.source in joined:
                 before: Any = nodes[node.source]
                 mask = None if masks is None else masks[level]
-                value = convolve_rectified(params[before.layer], *read(before), mask, precision)
+                value = convolve_rectified(
+                    params[before.layer], *read(before), mask, precision, level
+                )
                 kept[index] = value > 0
             case Relu():
                 passes = values[node.source] > 0

@@ -30,10 +30,15 @@ class Weighted(NamedTuple):
     result: Float[Array, "h w c"]
 
 
-def convolve(layer: Any, x: Array, precision: Any) -> Array:
+def convolve(layer: Any, x: Array, precision: Any, level: int) -> Array:
     kernel = jnp.asarray(layer["kernel"])
-    value = same_convolution(x[None], kernel, precision)[0]
+    value = same_convolution(x[None], kernel, precision, rows_together(level))[0]
     return value + layer["bias"] if "bias" in layer else value
+
+
+def rows_together(level: int) -> int:
+    """See `_amx.ALIGNED`."""
+    return max(_amx.ALIGNED >> level, 1)
 
 
 def folds(layer: Any, precision: Any) -> bool:
@@ -54,6 +59,7 @@ def convolve_rectified(
     others: Sequence[Array],
     inside: Array | None,
     precision: Any,
+    level: int,
 ) -> Array:
     """A convolution of `low`, upsampled, beside the others, and the ReLU that follows it."""
     kernel = jnp.asarray(layer["kernel"])
@@ -70,14 +76,18 @@ def convolve_rectified(
         bias=layer.get("bias"),
         inside=None if inside is None else inside[None, :, :, 0].astype(jnp.uint8),
         relu=True,
+        together=rows_together(level),
     )[0]
 
 
-def convolve_upsampled(layer: Any, low: Array, others: Sequence[Array], precision: Any) -> Array:
+def convolve_upsampled(
+    layer: Any, low: Array, others: Sequence[Array], precision: Any, level: int
+) -> Array:
     h, w, _ = low.shape
     skip = jnp.concatenate(others, axis=-1) if others else jnp.zeros((2 * h, 2 * w, 0), low.dtype)
     kernel = jnp.asarray(layer["kernel"])
-    value = upsampled_convolution(low[None], skip[None], kernel, precision)[0]
+    together = rows_together(level)
+    value = upsampled_convolution(low[None], skip[None], kernel, precision, together)[0]
     return value + layer["bias"] if "bias" in layer else value
 
 

@@ -14,6 +14,7 @@ from flax.traverse_util import flatten_dict
 from jaxtyping import Array, Bool, Float
 
 from progden_jax import _safetensors
+from progden_jax._amx import ALIGNED
 from progden_jax._bands import in_bands, rows_of
 from progden_jax.mixers.architectures import ARCHITECTURES, Architecture, Params, build, name_of
 from progden_jax.mixing import ClosedForm, Mixer, level_of
@@ -90,7 +91,12 @@ class NetworkMixer:
 
         # GPUs would else take TF32.
         with jax.default_matmul_precision("highest"):
-            return in_bands(applied, known, x.shape[0], rows=rows, halo=self.receptive_radius)
+            return in_bands(
+                *(applied, known, x.shape[0]),
+                rows=rows,
+                halo=self.receptive_radius,
+                multiple=1 if x.shape[0] % ALIGNED else ALIGNED,
+            )
 
     @property
     def receptive_radius(self) -> int:
