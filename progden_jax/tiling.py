@@ -13,7 +13,7 @@ from progden_jax.frame import Frame
 from progden_jax.mixing import Mixer
 from progden_jax.tstatistic import Bound
 
-SHARES = 64
+SHARES = 128
 """A window's edge is so many parts of its canvas's, or fewer: the more, the less is wasted, but the fewer
 frames share a program."""
 

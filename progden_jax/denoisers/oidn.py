@@ -95,15 +95,11 @@ class OIDN(Network):
     def exposure_of(self, frame: Frame, valid: Valid) -> Array:
         exposure = self.exposure
         if exposure is None:
-            exposure = autoexposure(frame.color, valid=valid)
+            exposure = autoexposure(lax.stop_gradient(frame.color), valid=valid)
         return lax.stop_gradient(jnp.asarray(exposure, frame.color.dtype))
 
     def __repr__(self) -> str:
         return f"OIDN({self.name!r}, inputs={self.inputs}, exposure={self.exposure})"
-
-
-_BAND = 512
-"""Rows."""
 
 
 @jax.jit
@@ -113,28 +109,23 @@ def autoexposure(color: Float[Array, "h w 3"], *, valid: Valid = None) -> Float[
     `valid` is the true (height, width), may be traced, of an image padded beyond it.
     """
     height, width = color.shape[:2] if valid is None else valid
-    weights = jnp.asarray([0.212671, 0.715160, 0.072169], color.dtype)
     rows, row_counts = _bins(color.shape[0], height, color.dtype)
     columns, column_counts = _bins(color.shape[1], width, color.dtype)
     exact = lax.Precision.HIGHEST
 
-    def add_band(sums: Array, band: tuple[Array, Array]) -> tuple[Array, None]:
-        pixels, members = band
-        sane = jnp.where((pixels < 0) | jnp.isnan(pixels), 0, pixels)
-        luminance = (jnp.minimum(sane, jnp.finfo(color.dtype).max) * weights).sum(-1)
-        return sums + jnp.matmul(members.T, luminance, precision=exact), None
+    # Row by row, with pixels and channels as one axis: a huge frame's luminance would take a third of its memory,
+    # and loops over three channels are no vectors.
+    def add_row(sums: Array, given: tuple[Array, Array]) -> tuple[Array, None]:
+        row, which = given
+        sane = jnp.where((row < 0) | jnp.isnan(row), 0, row)
+        return sums.at[which].add(jnp.minimum(sane, jnp.finfo(row.dtype).max), mode="drop"), None
 
-    # In bands, for a huge frame's luminance and copies of it would take more memory than the frame.
-    sums = jnp.zeros((len(rows), color.shape[1]), color.dtype)
-    whole = color.shape[0] // _BAND * _BAND
-    if whole:
-        bands = (color[:whole], rows.T[:whole])
-        sums, _ = lax.scan(
-            add_band, sums, jax.tree.map(lambda a: a.reshape(-1, _BAND, *a.shape[1:]), bands)
-        )
-    if whole < color.shape[0]:
-        sums, _ = add_band(sums, (color[whole:], rows.T[whole:]))
-    sums = jnp.matmul(sums, columns.T, precision=exact)
+    of_row = jnp.where(rows.any(0), rows.argmax(0), len(rows))
+    flat = color.reshape(len(color), -1)
+    sums, _ = lax.scan(add_row, jnp.zeros((len(rows), flat.shape[1]), color.dtype), (flat, of_row))
+    weights = jnp.asarray([0.212671, 0.715160, 0.072169], color.dtype)
+    luminance = (sums.reshape(len(rows), -1, 3) * weights).sum(-1)
+    sums = jnp.matmul(luminance, columns.T, precision=exact)
     counts = row_counts[:, None] * column_counts
     means = sums / jnp.maximum(counts, 1)
     lit = (means > 1e-8) & (counts > 0)
