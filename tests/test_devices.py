@@ -15,7 +15,7 @@ import pytest
 from jax.sharding import Mesh
 
 import progden_jax as pd
-from progden_jax import _devices
+from progden_jax import _amx, _devices
 from progden_jax.training.config import RunConfig
 from progden_jax.training.step import make_start, make_step
 
@@ -87,6 +87,24 @@ def on_three_devices(_):
     for found, given in zip(batch, frames, strict=True):
         assert_same(found, pd.progressive_denoise(given, network, **how))
     assert [result.skipped.computed > 0 for result in batch] == [True, True, False, True]
+
+
+def test_the_program_for_gpus():
+    run("for_gpus", 1)
+
+
+def for_gpus(_):
+    """As far as it goes without one: the whole lowers, and its convolutions are as precise as asked for."""
+    jax.default_backend = lambda: "gpu"
+    frame, _, how = job((48, 64))
+    for precision, said in (("highest", "HIGHEST"), ("tensorfloat32", "TF32"), ("bfloat16", "xbf16>")):
+        network = pd.denoisers.load("oidn-hdr-small", precision=precision)
+        export = jax.export.export(jax.jit(pd.progressive_denoise), platforms=["cuda"])
+        text = export(frame, network, **how).mlir_module()
+        found = [line for line in text.splitlines() if "stablehlo.convolution" in line]
+        assert len(found) >= 2 * len(network.params)
+        assert all(said in line for line in found), found[0]
+        assert _amx.TARGET not in text
 
 
 class Line:
