@@ -97,7 +97,11 @@ def for_gpus(_):
     """As far as it goes without one: the whole lowers, and its convolutions are as precise as asked for."""
     jax.default_backend = lambda: "gpu"
     frame, _, how = job((48, 64))
-    for precision, said in (("highest", "HIGHEST"), ("tensorfloat32", "TF32"), ("bfloat16", "xbf16>")):
+    for precision, said in (
+        ("highest", "HIGHEST"),
+        ("tensorfloat32", "TF32"),
+        ("bfloat16", "xbf16>"),
+    ):
         network = pd.denoisers.load("oidn-hdr-small", precision=precision)
         export = jax.export.export(jax.jit(pd.progressive_denoise), platforms=["cuda"])
         text = export(frame, network, **how).mlir_module()

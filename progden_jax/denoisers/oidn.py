@@ -113,8 +113,8 @@ def autoexposure(color: Float[Array, "h w 3"], *, valid: Valid = None) -> Float[
     columns, column_counts = _bins(color.shape[1], width, color.dtype)
     exact = lax.Precision.HIGHEST
 
-    # Row by row, for a huge frame's luminance would take a third of its memory, and with pixels and channels as
-    # one axis, for loops over three channels are no vectors.
+    # Row by row, for a huge frame's luminance takes a third of its memory; pixels and channels as one
+    # axis, for loops over three channels are no vectors.
     def add_row(sums: Array, given: tuple[Array, Array]) -> tuple[Array, None]:
         row, which = given
         sane = jnp.where((row < 0) | jnp.isnan(row), 0, row)
