@@ -60,7 +60,7 @@ class OIDN(Network):
     precision : of the convolutions; "highest" keeps float32 on GPUs. "tensorfloat32" (GPUs) is about
         6e-4 off in the image and 4 % in the divergence, "bfloat16" 6e-3 and 10 % (relative RMSE per
         pixel: experiments/stability). Neither will do for finite differences. On CPUs with AMX (`progden
-        devices`) "high" is 4e-6 off in each convolution and takes a quarter less time; elsewhere on
+        devices`) "high" is 4e-6 off in each convolution and hardly saves time; elsewhere on
         CPUs all but "bfloat16" are float32. Exact("cone") computes in
         float32 whatever this says.
     """
