@@ -98,8 +98,8 @@ def for_gpus(_):
     jax.default_backend = lambda: "gpu"
     frame, _, how = job((48, 64))
     for precision, said in (
-        ("highest", "HIGHEST"),
-        ("tensorfloat32", "TF32"),
+        ("highest", "HIGHEST>"),
+        ("tensorfloat32", "HIGH>"),
         ("bfloat16", "xbf16>"),
     ):
         network = pd.denoisers.load("oidn-hdr-small", precision=precision)
