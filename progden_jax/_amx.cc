@@ -38,7 +38,8 @@ constexpr int64_t kTile = 16;       // rows of a tile, and float32 in one of its
 constexpr int64_t kDepth = 32;      // bfloat16 in one of its rows
 constexpr int64_t kHalves = 512;    // bfloat16 in a tile
 constexpr int64_t kPixels = 32;     // of a block, by as many outputs: four tiles of sums
-constexpr int64_t kPatch = 1 << 20; // bytes that a task's input may take, of a second-level cache's 2 MiB
+constexpr int64_t kSums = 4 * kTile * kTile + kTile;  // of a line of a block; all 4 KiB apart would evict each other
+constexpr int64_t kPatch = 1 << 19; // bytes that a task's input may take, of a second-level cache's 2 MiB
 
 struct Free {
   void operator()(void* memory) const { std::free(memory); }
@@ -85,20 +86,24 @@ inline void split(__m512 x, __m256i (&parts)[P]) {
   }
 }
 
-// A sum of vectors; the weights are constants, and most of them 0 or 1.
-template <int Q>
-inline __m512 combined(const float (&weights)[Q], const __m512 (&vectors)[Q]) {
-  __m512 sum = _mm512_setzero_ps();
-  bool begun = false;
-#pragma GCC unroll 8
-  for (int q = 0; q < Q; ++q) {
-    if (weights[q] == 0) continue;
-    const __m512 weight = _mm512_set1_ps(weights[q]);
-    if (begun) sum = weights[q] == 1 ? _mm512_add_ps(sum, vectors[q]) : _mm512_fmadd_ps(weight, vectors[q], sum);
-    else sum = weights[q] == 1 ? vectors[q] : _mm512_mul_ps(weight, vectors[q]);
-    begun = true;
-  }
-  return sum;
+// Three bfloat16 whose sum is x, the upper halves of these: 24 bits are three times eight.
+inline void cut(__m512 x, __m512 (&parts)[3]) {
+  const __m512i upper = _mm512_set1_epi32(0xffff0000);
+  auto above = [&](__m512 v) { return _mm512_castsi512_ps(_mm512_and_si512(_mm512_castps_si512(v), upper)); };
+  parts[0] = x;
+  parts[1] = _mm512_sub_ps(x, above(x));
+  parts[2] = _mm512_sub_ps(parts[1], above(parts[1]));
+}
+
+// The upper halves of two vectors: one after the other, or woven.
+template <bool Woven>
+inline __m512i upper_halves(__m512 a, __m512 b) {
+  const __m512i low = _mm512_castps_si512(a), high = _mm512_castps_si512(b);
+  if (Woven)  // (mask & high) | (~mask & low >> 16)
+    return _mm512_ternarylogic_epi32(_mm512_set1_epi32(0xffff0000), high, _mm512_srli_epi32(low, 16), 0xca);
+  alignas(64) static constexpr int16_t kOdd[32] = {1,  3,  5,  7,  9,  11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31,
+                                                   33, 35, 37, 39, 41, 43, 45, 47, 49, 51, 53, 55, 57, 59, 61, 63};
+  return _mm512_permutex2var_epi16(low, _mm512_load_si512(kOdd), high);
 }
 
 // R rows of outputs from lines, which are sums of rows of the image, and kernels of lines, sums of rows of taps:
@@ -107,6 +112,7 @@ template <int R_, int T_>
 struct Toom {
   static constexpr int R = R_, T = T_, Q = R + T - 1;
   static constexpr bool kSummed = false;  // Each line has sums of its own.
+  bool mirrored[Q] = {};                  // Where the next point is the negative of this one.
   float in[Q][Q] = {}, taps[Q][T] = {}, out[R][Q] = {};
 
   constexpr explicit Toom(const double (&points)[Q - 1]) {
@@ -119,6 +125,7 @@ struct Toom {
         if (finite) scale *= points[q] - points[k];
       }
       for (int j = 0; j < Q; ++j) in[q][j] = static_cast<float>(product[j]);
+      mirrored[q] = q + 1 < Q - 1 && points[q] > 0 && points[q + 1] == -points[q];
       double power = 1;
       for (int j = 0; j < Q; ++j) {
         if (j < T) taps[q][j] = static_cast<float>(finite ? power / scale : j == T - 1);
@@ -141,8 +148,86 @@ struct Toom22 : Toom<2, 2> { constexpr Toom22() : Toom(kThree) {} };
 struct Direct {
   static constexpr int R = 1, T = 0, Q = 1;
   static constexpr bool kSummed = true;
+  bool mirrored[1] = {};
   float in[1][1] = {{1}}, out[1][1] = {{1}};
 };
+
+// What a constant times x adds to a sum of which nothing is there before the first term.
+template <class W, bool Begun>
+inline __m512 plus(__m512 sum, __m512 x) {
+  constexpr float weight = W::value();
+  if constexpr (weight == 0) return sum;
+  else if constexpr (weight == 1) return Begun ? _mm512_add_ps(sum, x) : x;
+  else return Begun ? _mm512_fmadd_ps(_mm512_set1_ps(weight), x, sum) : _mm512_mul_ps(_mm512_set1_ps(weight), x);
+}
+
+template <class S, int q, int j>
+struct Of {
+  static constexpr float value() { return S{}.in[q][j]; }
+};
+
+template <class S, int r, int q>
+struct To {
+  static constexpr float value() { return S{}.out[r][q]; }
+};
+
+// Of line q the rows from j on, each `Step` further.
+template <class S, int q, int j, int Step, bool Begun = false>
+inline __m512 summed(const __m512 (&rows)[S::Q], __m512 sum = _mm512_setzero_ps()) {
+  if constexpr (j >= S::Q) return sum;
+  else {
+    using W = Of<S, q, j>;
+    return summed<S, q, j + Step, Step, Begun || W::value() != 0>(rows, plus<W, Begun>(sum, rows[j]));
+  }
+}
+
+// Points p and -p share what even rows add up to, and what odd ones do.
+template <class S, int q = 0>
+inline void to_lines(const __m512 (&rows)[S::Q], __m512 (&lines)[S::Q]) {
+  if constexpr (q < S::Q) {
+    if constexpr (S{}.mirrored[q]) {
+      const __m512 even = summed<S, q, 0, 2>(rows), odd = summed<S, q, 1, 2>(rows);
+      lines[q] = _mm512_add_ps(even, odd);
+      lines[q + 1] = _mm512_sub_ps(even, odd);
+      to_lines<S, q + 2>(rows, lines);
+    } else {
+      lines[q] = summed<S, q, 0, 1>(rows);
+      to_lines<S, q + 1>(rows, lines);
+    }
+  }
+}
+
+// Lines of p and -p become their sum, for even rows, and their difference, for odd ones.
+template <class S, int q = 0>
+inline void fold(__m512 (&lines)[S::Q]) {
+  if constexpr (q < S::Q) {
+    if constexpr (S{}.mirrored[q]) {
+      const __m512 first = lines[q];
+      lines[q] = _mm512_add_ps(first, lines[q + 1]);
+      lines[q + 1] = _mm512_sub_ps(first, lines[q + 1]);
+    }
+    fold<S, q + 1>(lines);
+  }
+}
+
+template <class S, int r, int q = 0, bool Begun = false>
+inline __m512 row(const __m512 (&folded)[S::Q], __m512 sum = _mm512_setzero_ps()) {
+  if constexpr (q >= S::Q) return sum;
+  else {
+    constexpr bool mirrored = S{}.mirrored[q];
+    using W = To<S, r, q>;
+    const __m512 next = plus<W, Begun>(sum, folded[q + (mirrored && r % 2)]);
+    return row<S, r, q + 1 + mirrored, Begun || W::value() != 0>(folded, next);
+  }
+}
+
+template <class S, int r = 0>
+inline void to_rows(const __m512 (&folded)[S::Q], __m512 (&rows)[S::R]) {
+  if constexpr (r < S::R) {
+    rows[r] = row<S, r>(folded);
+    to_rows<S, r + 1>(folded, rows);
+  }
+}
 
 struct Source {
   const float* image;   // n, h, w, c
@@ -162,6 +247,7 @@ struct Part {
   Memory memory = {};
   Half* packed = nullptr;     // [parity][16 outputs][line][step][plane] tiles
   int64_t steps = 0;          // of a row of taps
+  bool woven = false;         // Of each 16 values the first 8 stand between the others: that takes no shuffles.
 
   template <class S>
   int64_t lines() const { return S::kSummed ? taps.size() : S::Q; }
@@ -170,6 +256,7 @@ struct Part {
 struct Job {
   std::vector<Part> parts;
   const float* bias = nullptr;      // outputs
+  const float* plus = nullptr;      // n, H, W, outputs: added
   const uint8_t* gate = nullptr;    // n, H / bits, W, outputs: where values pass, a bit for each of `bits` rows
   const uint8_t* inside = nullptr;  // images, H, W: zero elsewhere
   int64_t bits = 1, images = 1;
@@ -194,9 +281,9 @@ void pack_line(const Job& job, const Part& part, int64_t parity, int64_t t, int6
   const Source& s = part.of;
   const int64_t depth = s.kw * s.c, stride = (s.corners ? 4 : 1) * job.outputs;
   const __mmask16 mask = first(job.outputs - t * kTile);
-  const float* at = s.kernel + (s.corners ? parity : 0) * job.outputs + t * kTile;
+  const float* from = s.kernel + (s.corners ? parity : 0) * job.outputs + t * kTile;
   auto value = [&](int64_t k) {
-    auto tap = [&](int64_t n) { return _mm512_maskz_loadu_ps(mask, at + (part.taps[n] * depth + k) * stride); };
+    auto tap = [&](int64_t n) { return _mm512_maskz_loadu_ps(mask, from + (part.taps[n] * depth + k) * stride); };
     if (k >= depth) return _mm512_setzero_ps();
     if constexpr (S::kSummed) {
       return tap(line);
@@ -209,8 +296,9 @@ void pack_line(const Job& job, const Part& part, int64_t parity, int64_t t, int6
   };
   for (int64_t k = 0; k < part.steps * kDepth; k += 2, to += (k % kDepth ? kDepth : kDepth + (P - 1) * kHalves)) {
     __m256i even[P], odd[P];
-    split<P>(value(k), even);
-    split<P>(value(k + 1), odd);
+    const int64_t at = part.woven ? k / kTile * kTile + k % kTile / 2 : k;
+    split<P>(value(at), even);
+    split<P>(value(at + (part.woven ? kTile / 2 : 1)), odd);
     for (int p = 0; p < P; ++p) {
       const __m512i high = _mm512_slli_epi32(_mm512_cvtepu16_epi32(odd[p]), 16);
       _mm512_store_si512(to + p * kHalves, _mm512_or_si512(high, _mm512_cvtepu16_epi32(even[p])));
@@ -222,6 +310,7 @@ template <int P, class S>
 void pack(const Job& job, Part& part) {
   const int64_t parities = part.of.corners ? 4 : 1, lines = part.lines<S>();
   part.steps = (part.of.kw * part.of.c + kDepth - 1) / kDepth;
+  part.woven = P == 3 && part.of.c % kTile == 0;
   part.packed = part.memory.reserve<Half>(parities * job.tiles() * lines * part.steps * P * kHalves);
   Half* to = part.packed;
   for (int64_t parity = 0; parity < parities; ++parity)
@@ -230,11 +319,50 @@ void pack(const Job& job, Part& part) {
         pack_line<P, S>(job, part, parity, t, line, to);
 }
 
+// 32 values at k of each line from so many rows, of which `kept` are there and the others are zeros.
+template <int P, class S, bool Woven>
+inline void round_lines(const float* const (&from)[S::Q], const __mmask32 (&kept)[S::Q], int64_t k, Half* to,
+                        int64_t line, int64_t plane, __mmask32 wanted) {
+  __m512 low[S::Q], high[S::Q], a[S::Q], b[S::Q];
+  for (int q = 0; q < S::Q; ++q) {
+    const __mmask16 one = kept[q], two = kept[q] >> 16;
+    if (Woven) {
+      auto both = [&](int64_t at) {
+        const __m512 begin = _mm512_castps256_ps512(_mm256_maskz_loadu_ps(one, from[q] + at));
+        return _mm512_insertf32x8(begin, _mm256_maskz_loadu_ps(two, from[q] + at + kTile), 1);
+      };
+      low[q] = both(k);
+      high[q] = both(k + kTile / 2);
+    } else {
+      low[q] = _mm512_maskz_loadu_ps(one, from[q] + k);
+      high[q] = _mm512_maskz_loadu_ps(two, from[q] + k + kTile);
+    }
+  }
+  to_lines<S>(low, a);
+  to_lines<S>(high, b);
+  to += k;
+  for (int q = 0; q < S::Q; ++q, to += line) {
+    if constexpr (P == 3) {
+      __m512 x[3], y[3];
+      cut(a[q], x);
+      cut(b[q], y);
+      for (int p = 0; p < P; ++p) _mm512_mask_storeu_epi16(to + p * plane, wanted, upper_halves<Woven>(x[p], y[p]));
+    } else {
+      for (int p = 0; p < P; ++p) {
+        const __m512i both = (__m512i)_mm512_cvtne2ps_pbh(b[q], a[q]);
+        _mm512_mask_storeu_epi16(to + p * plane, wanted, both);
+        if (p + 1 == P) break;
+        a[q] = rest(a[q], widened(_mm512_castsi512_si256(both)));
+        b[q] = rest(b[q], widened(_mm512_extracti64x4_epi64(both, 1)));
+      }
+    }
+  }
+}
+
 // Lines of the rows from `y` on, so many times R of them, and of columns from patch.x: zeros beyond the image, as P
 // bfloat16 each.
 template <int P, class S>
 void gather(const Part& part, int64_t image, int64_t y, int64_t times, int64_t columns, Memory& memory, Patch& patch) {
-  static constexpr S scheme{};
   const Source& s = part.of;
   patch.row = columns * s.c;
   // A block may reach beyond the last pixel: what it finds there is not kept, but must be there to be read.
@@ -255,34 +383,154 @@ void gather(const Part& part, int64_t image, int64_t y, int64_t times, int64_t c
         std::memset(line + end, 0, (patch.row - end) * sizeof(Half));
       }
     const float* from[S::Q];
-    __mmask16 there[S::Q];
+    __mmask32 there[S::Q];
     for (int q = 0; q < S::Q; ++q) {
       const int64_t r = y + (n * S::R + q) * part.every;
-      there[q] = r >= 0 && r < s.h ? 0xffff : 0;
+      there[q] = r >= 0 && r < s.h ? ~0u : 0;
       from[q] = s.image + ((image * s.h + (there[q] ? r : 0)) * s.w + patch.x) * s.c;
     }
     for (int64_t k = begin; k < end; k += 2 * kTile) {
-      const __mmask16 lower = first(end - k), upper = first(end - k - kTile);
-      __m512 low[S::Q], high[S::Q];
-      for (int q = 0; q < S::Q; ++q) {
-        low[q] = _mm512_maskz_loadu_ps(lower & there[q], from[q] + k);
-        high[q] = _mm512_maskz_loadu_ps(upper & there[q], from[q] + k + kTile);
-      }
-      for (int q = 0; q < S::Q; ++q) {
-        __m512 a = combined(scheme.in[q], low), b = combined(scheme.in[q], high);
-        for (int p = 0; p < P; ++p) {
-          const __m512i both = (__m512i)_mm512_cvtne2ps_pbh(b, a);
-          const __mmask32 kept = static_cast<__mmask32>(upper) << 16 | lower;
-          _mm512_mask_storeu_epi16(to + q * patch.row + p * patch.plane + k, kept, both);
-          if (p + 1 < P) {
-            a = rest(a, widened(_mm512_castsi512_si256(both)));
-            b = rest(b, widened(_mm512_extracti64x4_epi64(both, 1)));
-          }
-        }
-      }
+      const __mmask32 wanted = static_cast<__mmask32>(first(end - k - kTile)) << 16 | first(end - k);
+      __mmask32 kept[S::Q];
+      for (int q = 0; q < S::Q; ++q) kept[q] = there[q] & wanted;
+      (P == 3 && part.woven ? round_lines<P, S, P == 3> : round_lines<P, S, false>)(from, kept, k, to, patch.row,
+                                                                                   patch.plane, wanted);
     }
   }
 }
+
+struct Place {
+  int64_t image, i, j, y, x, t;  // i, j: parity; y, x: cell; t: first tile of outputs
+};
+
+// Where values of a block pass, and as what.
+struct Mask {
+  const uint8_t* inside = nullptr;  // of its first pixel
+  const uint8_t* gate = nullptr;    // of its first pixel and output
+  char bit = 1;
+
+  Mask() = default;
+  Mask(const Job& job, const Place& at, int64_t row) {
+    const int64_t y = (at.y + row) * job.step + at.i, x = at.x * job.step + at.j;
+    if (job.inside) inside = job.inside + ((job.images > 1 ? at.image : 0) * job.H + y) * job.W + x;
+    if (job.gate)
+      gate = job.gate + ((at.image * (job.H / job.bits) + y / job.bits) * job.W + x) * job.outputs + at.t * kTile;
+    bit = static_cast<char>(1 << y % job.bits);
+  }
+
+  // Whether any value of those pixels passes. Where all are inside, that need not be asked again.
+  bool any(const Job& job, const Place& at, int64_t pixels) {
+    int64_t found = inside ? 0 : pixels;
+    for (int64_t p = 0; inside && p < pixels; ++p) found += inside[p * job.step] != 0;
+    if (found == pixels) inside = nullptr;
+    if (!found || !gate) return found;
+    const int64_t left = job.outputs - at.t * kTile;
+    const __mmask32 wanted = left >= 2 * kTile ? ~0u : (1u << left) - 1;
+    __m256i all = _mm256_setzero_si256();
+    for (int64_t p = 0; p < pixels; ++p)
+      all = _mm256_or_si256(all, _mm256_maskz_loadu_epi8(wanted, gate + p * job.step * job.outputs));
+    return !_mm256_testz_si256(all, _mm256_set1_epi8(bit));
+  }
+};
+
+// 32 pixels by 32 outputs by R rows.
+template <class S>
+struct Block {
+  Place at;
+  int64_t rows, pixels;
+  Mask masks[S::R];
+};
+
+// Writing a block's sums through bias, addend, ReLU, gate and bounds, some pixels by 16 outputs by R rows at a time.
+template <class S>
+class Finishing {
+ public:
+  void begin(const Job& job, const Block<S>& block, const float* sums) {
+    job_ = &job, block_ = block, sums_ = sums;
+    half_ = -1, pixel_ = block.pixels;
+    halves_ = job.outputs - block.at.t * kTile > kTile ? 2 : 1;
+    left_ = halves_ * block.pixels;
+    plain_ = block.rows == S::R;
+    for (int64_t r = 0; r < block.rows; ++r) plain_ = plain_ && !block.masks[r].gate && !block.masks[r].inside;
+  }
+
+  int64_t left() const { return (left_ + kAtOnce - 1) / kAtOnce; }
+
+  void all() {
+    while (advance()) {}
+  }
+
+  inline bool advance() {
+    if (!left_) return false;
+    if (pixel_ == block_.pixels) next_half();
+    const int64_t count = std::min<int64_t>(kAtOnce, block_.pixels - pixel_);
+    if (plain_ && count == kAtOnce) some<true>(kAtOnce);
+    else some<false>(count);
+    pixel_ += count, left_ -= count;
+    at_ += count * next_;
+    return true;
+  }
+
+ private:
+  static constexpr int64_t kAtOnce = 4;
+
+  template <bool Plain>
+  inline void some(int64_t count) {
+    const Job& job = *job_;
+    const __m512 zero = _mm512_setzero_ps(), bias = bias_;
+    const __mmask16 wanted = wanted_;
+    const bool relu = job.relu;
+    const int64_t next = next_, row = row_;
+    const float* sums = sums_ + pixel_ * 2 * kTile + half_ * kTile;
+    const float* plus = job.plus ? job.plus + at_ : nullptr;
+    float* out = job.out + at_;
+    for (int64_t p = 0; p < count; ++p, sums += 2 * kTile, out += next) {
+      __m512 lines[S::Q], rows[S::R];
+      for (int q = 0; q < S::Q; ++q) lines[q] = _mm512_load_ps(sums + q * kSums);
+      fold<S>(lines);
+      to_rows<S>(lines, rows);
+#pragma GCC unroll 4
+      for (int r = 0; r < S::R; ++r) {
+        if (!Plain && r >= block_.rows) break;
+        __m512 value = _mm512_add_ps(rows[r], bias);
+        if (plus) value = _mm512_add_ps(value, _mm512_maskz_loadu_ps(wanted, plus + p * next + r * row));
+        if (!Plain) {
+          const Mask& mask = block_.masks[r];
+          if (mask.gate) {
+            const uint8_t* of = mask.gate + (pixel_ + p) * next + half_ * kTile;
+            const __mmask16 passes = _mm_test_epi8_mask(_mm_maskz_loadu_epi8(wanted, of), _mm_set1_epi8(mask.bit));
+            value = _mm512_maskz_mov_ps(passes, value);
+          }
+          if (mask.inside && !mask.inside[(pixel_ + p) * job.step]) value = zero;
+        }
+        // Of NaN the second is taken.
+        if (relu) value = _mm512_max_ps(value, zero);
+        _mm512_mask_storeu_ps(out + r * row, wanted, value);
+      }
+    }
+  }
+
+  void next_half() {
+    const Job& job = *job_;
+    const Place& at = block_.at;
+    const int64_t output = at.t * kTile + ++half_ * kTile;
+    const int64_t y = at.y * job.step + at.i, x = at.x * job.step + at.j;
+    pixel_ = 0;
+    next_ = job.step * job.outputs;
+    row_ = next_ * job.W;
+    at_ = ((at.image * job.H + y) * job.W + x) * job.outputs + output;
+    wanted_ = first(job.outputs - output);
+    bias_ = job.bias ? _mm512_maskz_loadu_ps(wanted_, job.bias + output) : _mm512_setzero_ps();
+  }
+
+  const Job* job_;
+  Block<S> block_;
+  const float* sums_;
+  int64_t half_, halves_, pixel_, left_ = 0, at_, next_, row_;
+  bool plain_;
+  __mmask16 wanted_;
+  __m512 bias_;
+};
 
 // M by N tiles of sums: 0 to 3. Of pixels 4 and 5, of kernels 6 and 7.
 template <int M>
@@ -305,10 +553,10 @@ inline void multiply() {
   if (M > 1 && N > 1) _tile_dpbf16ps(3, 5, 7);
 }
 
-// Small products first.
-template <int P, int M, int N>
+// Small products first. Between them vector units write the block before.
+template <int P, int M, int N, class S>
 inline void add_lines(const Half* pixels, int64_t stride, const Patch& patch, const Half* kernels, int64_t next,
-                      int64_t lines, int64_t steps) {
+                      int64_t lines, int64_t steps, Finishing<S>& before, int64_t each) {
   alignas(64) float unused[kTile * kTile];
   for (int64_t line = 0; line < lines; ++line, pixels += patch.row)
     for (int64_t k = 0; k < steps; ++k, kernels += P * kHalves) {
@@ -335,19 +583,18 @@ inline void add_lines(const Half* pixels, int64_t stride, const Patch& patch, co
       multiply<M, N>();
       // Kept by nobody: without it storing the sums takes 0.3 us longer, as after any 130 products or more.
       _tile_stored(6, unused, 64);
+      for (int64_t n = 0; n < each; ++n) before.advance();
     }
 }
 
-struct Place {
-  int64_t image, i, j, y, x, t;  // i, j: parity; y, x: cell; t: first tile of outputs
-};
-
-constexpr int64_t kSums = 4 * kTile * kTile;  // of a line of a block
-
 // Of a block from the patches' line on.
 template <int P, int M, int N, class S>
-void add_block(const Job& job, const Patch* patches, int64_t line, const Place& at, float* sums) {
+void add_block(const Job& job, const Patch* patches, int64_t line, const Place& at, float* sums,
+               Finishing<S>& before) {
   constexpr int64_t kRow = 2 * kTile;
+  int64_t steps = 0;
+  for (const Part& part : job.parts) steps += part.lines<S>() * part.steps;
+  const int64_t each = (before.left() + steps - 1) / steps;
   for (int q = 0; q < S::Q; ++q, sums += kSums) {
     _tile_zero(0);
     if (N > 1) _tile_zero(1);
@@ -362,74 +609,13 @@ void add_block(const Job& job, const Patch* patches, int64_t line, const Place& 
       const int64_t x = s.corners ? at.x + at.j - 1 : at.x * job.step + at.j - s.kw / 2;
       const Half* pixels = patch.data + (line + q) * patch.row + (x - patch.x) * s.c;
       const Half* kernels = part.packed + ((parity * job.tiles() + at.t) * lines + q) * tile;
-      add_lines<P, M, N>(pixels, s.corners ? s.c : job.step * s.c, patch, kernels, lines * tile,
-                         S::kSummed ? lines : 1, part.steps);
+      add_lines<P, M, N, S>(pixels, s.corners ? s.c : job.step * s.c, patch, kernels, lines * tile,
+                            S::kSummed ? lines : 1, part.steps, before, each);
     }
     _tile_stored(0, sums, kRow * sizeof(float));
     if (N > 1) _tile_stored(1, sums + kTile, kRow * sizeof(float));
     if (M > 1) _tile_stored(2, sums + kTile * kRow, kRow * sizeof(float));
     if (M > 1 && N > 1) _tile_stored(3, sums + kTile * kRow + kTile, kRow * sizeof(float));
-  }
-}
-
-// Where values of a block pass, and as what.
-struct Mask {
-  const uint8_t* inside = nullptr;  // of its first pixel
-  const uint8_t* gate = nullptr;    // of its first pixel and output
-  char bit = 1;
-
-  Mask() = default;
-  Mask(const Job& job, const Place& at, int64_t row) {
-    const int64_t y = (at.y + row) * job.step + at.i, x = at.x * job.step + at.j;
-    if (job.inside) inside = job.inside + ((job.images > 1 ? at.image : 0) * job.H + y) * job.W + x;
-    if (job.gate)
-      gate = job.gate + ((at.image * (job.H / job.bits) + y / job.bits) * job.W + x) * job.outputs + at.t * kTile;
-    bit = static_cast<char>(1 << y % job.bits);
-  }
-
-  bool any(const Job& job, const Place& at, int64_t pixels) const {
-    bool found = !inside;
-    for (int64_t p = 0; p < pixels && !found; ++p) found = inside[p * job.step];
-    if (!found || !gate) return found;
-    const int64_t left = job.outputs - at.t * kTile;
-    const __mmask32 wanted = left >= 2 * kTile ? ~0u : (1u << left) - 1;
-    __m256i all = _mm256_setzero_si256();
-    for (int64_t p = 0; p < pixels; ++p)
-      all = _mm256_or_si256(all, _mm256_maskz_loadu_epi8(wanted, gate + p * job.step * job.outputs));
-    return !_mm256_testz_si256(all, _mm256_set1_epi8(bit));
-  }
-};
-
-// Sums of a block to so many rows of the output, through bias, ReLU, gate and bounds.
-template <class S>
-void finish(const Job& job, const Place& at, const Mask* masks, int64_t rows, int64_t pixels, const float* sums) {
-  static constexpr S scheme{};
-  const int64_t y = at.y * job.step + at.i, x = at.x * job.step + at.j, output = at.t * kTile;
-  const int64_t pixel = (at.image * job.H + y) * job.W + x;
-  const __m512 zero = _mm512_setzero_ps();
-  for (int64_t half = 0; half < 2; ++half) {
-    const __mmask16 wanted = first(job.outputs - output - half * kTile);
-    if (!wanted) break;
-    const __m512 bias = job.bias ? _mm512_maskz_loadu_ps(wanted, job.bias + output + half * kTile) : zero;
-    float* out = job.out + pixel * job.outputs + output + half * kTile;
-    for (int64_t p = 0; p < pixels; ++p, out += job.step * job.outputs) {
-      __m512 lines[S::Q];
-      for (int q = 0; q < S::Q; ++q) lines[q] = _mm512_load_ps(sums + q * kSums + p * 2 * kTile + half * kTile);
-#pragma GCC unroll 4
-      for (int r = 0; r < S::R; ++r) {
-        if (r >= rows) break;
-        const Mask& mask = masks[r];
-        __mmask16 passes = mask.inside && !mask.inside[p * job.step] ? 0 : 0xffff;
-        const __m512 value = _mm512_add_ps(combined(scheme.out[r], lines), bias);
-        // As a comparison with 0, so that NaN does not pass either.
-        if (job.relu) passes &= _mm512_cmp_ps_mask(value, zero, _CMP_GT_OQ);
-        if (mask.gate) {
-          const uint8_t* of = mask.gate + p * job.step * job.outputs + half * kTile;
-          passes &= _mm_test_epi8_mask(_mm_maskz_loadu_epi8(wanted, of), _mm_set1_epi8(mask.bit));
-        }
-        _mm512_mask_storeu_ps(out + r * job.step * job.W * job.outputs, wanted, _mm512_maskz_mov_ps(passes, value));
-      }
-    }
   }
 }
 
@@ -470,34 +656,38 @@ void task(const Job& job, int64_t index) {
   const Palette palette;
   _tile_loadconfig(&palette);
   Patch patches[3];
-  alignas(64) float sums[S::Q * kSums];
+  alignas(64) float sums[2][S::Q * kSums];
+  Finishing<S> before;
+  int64_t turn = 0;
   for (at.i = 0; at.i < job.step; ++at.i) {
     bool gathered = false;
     for (at.j = 0; at.j < job.step; ++at.j)
       for (at.t = 0; at.t < job.tiles(); at.t += 2)
         for (at.y = y0; at.y < y1; at.y += S::R)
           for (at.x = x0; at.x < x1; at.x += kPixels) {
-            const int64_t pixels = std::min(kPixels, x1 - at.x), rows = std::min<int64_t>(S::R, y1 - at.y);
-            const bool one = pixels <= kTile, last = job.tiles() - at.t == 1;
-            Mask masks[S::R];
+            Block<S> block{at, std::min<int64_t>(S::R, y1 - at.y), std::min(kPixels, x1 - at.x), {}};
+            const bool one = block.pixels <= kTile, last = job.tiles() - at.t == 1;
             bool any = false;
-            for (int64_t r = 0; r < rows; ++r) {
-              masks[r] = Mask(job, at, r);
-              any = any || masks[r].any(job, at, pixels);
+            for (int64_t r = 0; r < block.rows; ++r) {
+              block.masks[r] = Mask(job, at, r);
+              any = block.masks[r].any(job, at, block.pixels) || any;
             }
             // Padding around an image is all zeros, and costs no more than writing them.
             if (!any) {
-              zero(job, at, rows, pixels);
+              zero(job, at, block.rows, block.pixels);
               continue;
             }
             if (!gathered) gather_all<P, S>(job, at, y0, y1, x0, x1, memory, patches);
             gathered = true;
             const int64_t line = (at.y - y0) / S::R * S::Q;
             (one ? last ? add_block<P, 1, 1, S> : add_block<P, 1, 2, S>
-                 : last ? add_block<P, 2, 1, S> : add_block<P, 2, 2, S>)(job, patches, line, at, sums);
-            finish<S>(job, at, masks, rows, pixels, sums);
+                 : last ? add_block<P, 2, 1, S> : add_block<P, 2, 2, S>)(job, patches, line, at, sums[turn], before);
+            before.all();
+            before.begin(job, block, sums[turn]);
+            turn ^= 1;
           }
   }
+  before.all();
   _tile_release();
 }
 
@@ -583,7 +773,7 @@ using Bytes = ffi::Buffer<ffi::U8>;
 // Absent parts have no elements. low: n, H/2, W/2, c and its kernel 2, 2, c, 4 * outputs in the order of
 // parities; image: n, H, W, c and its kernel kh, kw, c, outputs.
 ffi::Error convolve(ffi::ThreadPool pool, Floats low, Floats low_kernel, Floats image, Floats kernel, Floats bias,
-                    Bytes gate, Bytes inside, ffi::ResultBuffer<ffi::F32> out, int64_t planes, int64_t bits,
+                    Floats plus, Bytes gate, Bytes inside, ffi::ResultBuffer<ffi::F32> out, int64_t planes, int64_t bits,
                     bool relu, int64_t together) try {
   Job job;
   const auto o = out->dimensions();
@@ -604,6 +794,7 @@ ffi::Error convolve(ffi::ThreadPool pool, Floats low, Floats low_kernel, Floats 
   if (!job.parts.empty()) job.step = 2;
   add(image, kernel, false);
   if (bias.element_count()) job.bias = bias.typed_data();
+  if (plus.element_count()) job.plus = plus.typed_data();
   if (gate.element_count()) job.gate = gate.typed_data();
   if (inside.element_count()) job.inside = inside.typed_data(), job.images = inside.dimensions()[0];
   job.bits = bits, job.relu = relu;
@@ -622,6 +813,7 @@ ffi::Error convolve(ffi::ThreadPool pool, Floats low, Floats low_kernel, Floats 
 XLA_FFI_DEFINE_HANDLER_SYMBOL(progden_convolve, convolve,
                               ffi::Ffi::Bind()
                                   .Ctx<ffi::ThreadPool>()
+                                  .Arg<Floats>()
                                   .Arg<Floats>()
                                   .Arg<Floats>()
                                   .Arg<Floats>()

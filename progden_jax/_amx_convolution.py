@@ -20,7 +20,7 @@ from progden_jax._slopes import bits_for, packed, unpacked
 from progden_jax._upsampling import corners, of_corners, shuffled
 
 _ABSENT: tuple[Any, ...] = (
-    *(np.zeros((0,) * rank, np.float32) for rank in (4, 4, 4, 4, 1)),
+    *(np.zeros((0,) * rank, np.float32) for rank in (4, 4, 4, 4, 1, 4)),
     *(np.zeros((0,) * rank, np.uint8) for rank in (4, 3)),
 )
 """What stands for an operand that is not given."""
@@ -36,6 +36,7 @@ def convolution(
     *,
     planes: int,
     bias: Float[Array, " co"] | None = None,
+    plus: Float[Array, "n h2 w2 co"] | None = None,
     gate: UInt8[Array, "n h3 w2 co"] | None = None,
     bits: int = 1,
     inside: UInt8[Array, "#n h2 w2"] | None = None,
@@ -52,7 +53,7 @@ def convolution(
         output pixels over each of `low`'s cells of 2×2 in raster order.
     image, kernel : of the output's size; the kernel's sides are odd.
     planes : how many bfloat16 stand for a value, see `_amx.planes`.
-    bias : added.
+    bias, plus : added.
     gate : zeros where it has no bit: bit r of row i is for row ``bits * i + r``.
     inside : zeros where it is 0.
     relu : zeros where the sum is not above 0.
@@ -66,7 +67,7 @@ def convolution(
     outputs = by.shape[-1]
     if image is None:
         h, w, outputs = 2 * h, 2 * w, outputs // 4
-    given = (low, folded, image, kernel, bias, gate, inside)
+    given = (low, folded, image, kernel, bias, plus, gate, inside)
     return _primitive.bind(
         *(b if a is None else a for a, b in zip(given, _ABSENT, strict=True)),
         shape=(n, h, w, outputs),
@@ -91,14 +92,14 @@ def _compiled_alone(**settings: Any) -> Any:
 
 def _jvp(operands: Sequence[Array], tangents: Sequence[Any], **settings: Any) -> tuple[Array, Any]:
     out = _primitive.bind(*operands, **settings)
-    low, folded, image, kernel, _, gate, inside = operands
-    by_low, by_folded, by_image, by_kernel, by_bias = (
-        None if isinstance(t, ad.Zero) or not t.size else t for t in tangents[:5]
+    low, folded, image, kernel, _, _, gate, inside = operands
+    by_low, by_folded, by_image, by_kernel, by_bias, by_plus = (
+        None if isinstance(t, ad.Zero) or not t.size else t for t in tangents[:6]
     )
     planes, bits = settings["planes"], settings["bits"]
     if settings["relu"]:
         bits = bits_for(out.shape[1])
-        gate, inside = packed(out > 0, bits), _ABSENT[6]
+        gate, inside = packed(out > 0, bits), _ABSENT[7]
     slopes = []
     if not (by_low is None and by_image is None):
         slopes.append(
@@ -106,13 +107,15 @@ def _jvp(operands: Sequence[Array], tangents: Sequence[Any], **settings: Any) ->
                 *((None, None) if by_low is None else (by_low, folded)),
                 *((None, None) if by_image is None else (by_image, kernel)),
                 planes=planes,
+                plus=by_plus,
                 gate=gate if gate.size else None,
                 bits=bits,
                 inside=inside if inside.size else None,
                 together=settings["together"],
             )
         )
-    by_weights = []
+        by_plus = None
+    by_weights = [] if by_plus is None else [by_plus]
     if by_folded is not None:
         by_weights.append(shuffled(by_products(low, of_corners(by_folded), None)))
     if by_kernel is not None:
@@ -140,11 +143,11 @@ def _transposed(
     relu: bool,
     together: int,
 ) -> list[Any]:
-    _, folded, _, kernel, bias, gate, inside = operands
+    _, folded, _, kernel, bias, _, gate, inside = operands
     if relu or bias.size:
         raise NotImplementedError("a convolution with a ReLU or a bias is not linear.")
     found: list[Any] = [None] * len(operands)
-    wanted = [i for i in (0, 2) if ad.is_undefined_primal(operands[i])]
+    wanted = [i for i in (0, 2, 5) if ad.is_undefined_primal(operands[i])]
     if isinstance(cotangent, ad.Zero):
         for i in wanted:
             found[i] = ad.Zero(operands[i].aval)
@@ -154,6 +157,8 @@ def _transposed(
         aval = operands[i].aval
         if not aval.size:
             found[i] = ad.Zero(aval)
+        elif i == 5:
+            found[i] = cotangent
         elif i == 0:
             found[i] = jax.linear_transpose(
                 lambda x: corners(x, folded, lax.Precision.HIGHEST), aval
@@ -181,7 +186,7 @@ def _batched(operands: Sequence[Array], axes: Sequence[Any], *, shape: Any, **se
     n = shape[0]
     joined = []
     for i, (a, d) in enumerate(zip(arrays, axes, strict=True)):
-        if i in weights or not a.size or (d is None and i == 6 and a.shape[0] == 1):
+        if i in weights or not a.size or (d is None and i == 7 and a.shape[0] == 1):
             joined.append(a[0] if d is not None else a)
             continue
         each = a if d is not None else jnp.broadcast_to(a, (size, *a.shape))

@@ -97,17 +97,22 @@ def rectified_convolution(
     kernel: Float[Array, "kh kw ci co"],
     bias: Float[Array, " co"],
     *,
+    plus: Float[Array, "*b h w co"] | None = None,
     inside: Bool[Array, "h w 1"] | None = None,
     precision: Any = None,
 ) -> Float[Array, "*b h w co"]:
-    """The ReLU of `same_convolution` and a bias, zero where not inside."""
+    """The ReLU of `same_convolution` and a bias, and of what is given to add, zero where not inside."""
     images = inputs.reshape(-1, *inputs.shape[-3:])
-    if planes := _amx.planes(precision, kernel, images, bias):
+    if plus is not None:
+        plus = plus.reshape(-1, *plus.shape[-3:])
+    others = (images, bias) if plus is None else (images, bias, plus)
+    if planes := _amx.planes(precision, kernel, *others):
         there = None if inside is None else inside[None, :, :, 0].astype(jnp.uint8)
-        settings: dict[str, Any] = {"bias": bias, "inside": there, "relu": True}
+        settings: dict[str, Any] = {"bias": bias, "plus": plus, "inside": there, "relu": True}
         out = convolution(None, None, images, kernel, planes=planes, **settings)
     else:
-        out = jax.nn.relu(same_convolution(images, kernel, precision) + bias)
+        out = same_convolution(images, kernel, precision) + bias
+        out = jax.nn.relu(out if plus is None else plus + out)
         out = out if inside is None else jnp.where(inside, out, 0)
     return out.reshape(*inputs.shape[:-1], kernel.shape[-1])
 
@@ -121,14 +126,17 @@ class RectifiedConv(nn.Module):
 
     @nn.compact
     def __call__(
-        self, inputs: Float[Array, "*b h w ci"], inside: Bool[Array, "h w 1"] | None
+        self,
+        inputs: Float[Array, "*b h w ci"],
+        inside: Bool[Array, "h w 1"] | None,
+        plus: Float[Array, "*b h w co"] | None = None,
     ) -> Float[Array, "*b h w co"]:
         shape = (self.size, self.size, inputs.shape[-1], self.features)
         kernel = self.param("kernel", self.kernel_init, shape)
         bias = self.param("bias", nn.initializers.zeros_init(), (self.features,))
         # As flax's convolutions do, in the type that all of them promote to.
         inputs, kernel, bias = promote_dtype(inputs, kernel, bias)
-        return rectified_convolution(inputs, kernel, bias, inside=inside)
+        return rectified_convolution(inputs, kernel, bias, plus=plus, inside=inside)
 
 
 def _of_products(precision: Any) -> Any:

@@ -78,9 +78,9 @@ class MixingNet(nn.Module):
     def setup(self) -> None:
         self.conv_in = RectifiedConv(self.width, 5)
         self.block1_conv1 = RectifiedConv(self.width, 3)
-        self.block1_conv2 = self._conv(self.width, 3)
+        self.block1_conv2 = RectifiedConv(self.width, 3)
         self.block2_conv1 = RectifiedConv(self.width, 3)
-        self.block2_conv2 = self._conv(self.width, 3)
+        self.block2_conv2 = RectifiedConv(self.width, 3)
         self.conv_out = self._conv(9 if self.ratio else 3, 3)
 
     def _conv(self, channels: int, size: int) -> nn.Conv:
@@ -100,7 +100,7 @@ class MixingNet(nn.Module):
             (self.block1_conv1, self.block1_conv2),
             (self.block2_conv1, self.block2_conv2),
         ):
-            h = masked(nn.relu(h + second(first(h, inside))))
+            h = second(first(h, inside), inside, plus=h)
         out = self.conv_out(h)
         return f_act(*jnp.split(out, 3, axis=-1)) if self.ratio else nn.sigmoid(out)
 

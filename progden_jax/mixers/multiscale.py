@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -107,23 +108,20 @@ class _Net(nn.Module):
         def start(scale: float) -> nn.initializers.Initializer:
             return nn.initializers.variance_scaling(scale, "fan_in", "truncated_normal")
 
-        def conv(h: Array, channels: int, size: int, name: str, scale: float) -> Array:
-            if inside is not None:
-                h = jnp.where(inside, h, 0)
-            return nn.Conv(
-                channels,
-                (size, size),
-                kernel_init=start(scale) if scale else nn.initializers.zeros_init(),
-                conv_general_dilated=convolve,
-                name=name,
-            )(h)
+        def masked(h: Array) -> Array:
+            return h if inside is None else jnp.where(inside, h, 0)
 
-        h = nn.relu(conv(stacked, self.width, 1, "conv_in", 1.0))
+        def conv(channels: int, size: int, init: Any, name: str) -> nn.Conv:
+            taps = (size, size)
+            settings: dict[str, Any] = {"kernel_init": init, "conv_general_dilated": convolve}
+            return nn.Conv(channels, taps, **settings, name=name)
+
+        h = masked(nn.relu(conv(self.width, 1, start(1.0), "conv_in")(masked(stacked))))
         for block in range(1, self.blocks + 1):
             first = RectifiedConv(self.width, 3, start(1.0), name=f"block{block}_conv1")
-            inner = first(h if inside is None else jnp.where(inside, h, 0), inside)
-            h = nn.relu(h + conv(inner, self.width, 3, f"block{block}_conv2", 0.1))
-        return conv(h, 3, 3, "conv_out", 0.0)
+            second = RectifiedConv(self.width, 3, start(0.1), name=f"block{block}_conv2")
+            h = second(first(h, inside), inside, plus=h)
+        return conv(3, 3, nn.initializers.zeros_init(), "conv_out")(h)
 
 
 def features(
