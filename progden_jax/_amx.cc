@@ -86,26 +86,6 @@ inline void split(__m512 x, __m256i (&parts)[P]) {
   }
 }
 
-// Three bfloat16 whose sum is x, the upper halves of these: 24 bits are three times eight.
-inline void cut(__m512 x, __m512 (&parts)[3]) {
-  const __m512i upper = _mm512_set1_epi32(0xffff0000);
-  auto above = [&](__m512 v) { return _mm512_castsi512_ps(_mm512_and_si512(_mm512_castps_si512(v), upper)); };
-  parts[0] = x;
-  parts[1] = _mm512_sub_ps(x, above(x));
-  parts[2] = _mm512_sub_ps(parts[1], above(parts[1]));
-}
-
-// The upper halves of two vectors: one after the other, or woven.
-template <bool Woven>
-inline __m512i upper_halves(__m512 a, __m512 b) {
-  const __m512i low = _mm512_castps_si512(a), high = _mm512_castps_si512(b);
-  if (Woven)  // (mask & high) | (~mask & low >> 16)
-    return _mm512_ternarylogic_epi32(_mm512_set1_epi32(0xffff0000), high, _mm512_srli_epi32(low, 16), 0xca);
-  alignas(64) static constexpr int16_t kOdd[32] = {1,  3,  5,  7,  9,  11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31,
-                                                   33, 35, 37, 39, 41, 43, 45, 47, 49, 51, 53, 55, 57, 59, 61, 63};
-  return _mm512_permutex2var_epi16(low, _mm512_load_si512(kOdd), high);
-}
-
 // R rows of outputs from lines, which are sums of rows of the image, and kernels of lines, sums of rows of taps:
 // out * ((taps * kernel) x (in * image)). At infinity and the finite points that `_points.py` found to round least.
 template <int R_, int T_>
@@ -247,7 +227,6 @@ struct Part {
   Memory memory = {};
   Half* packed = nullptr;     // [parity][16 outputs][line][step][plane] tiles
   int64_t steps = 0;          // of a row of taps
-  bool woven = false;         // Of each 16 values the first 8 stand between the others: that takes no shuffles.
 
   template <class S>
   int64_t lines() const { return S::kSummed ? taps.size() : S::Q; }
@@ -296,9 +275,8 @@ void pack_line(const Job& job, const Part& part, int64_t parity, int64_t t, int6
   };
   for (int64_t k = 0; k < part.steps * kDepth; k += 2, to += (k % kDepth ? kDepth : kDepth + (P - 1) * kHalves)) {
     __m256i even[P], odd[P];
-    const int64_t at = part.woven ? k / kTile * kTile + k % kTile / 2 : k;
-    split<P>(value(at), even);
-    split<P>(value(at + (part.woven ? kTile / 2 : 1)), odd);
+    split<P>(value(k), even);
+    split<P>(value(k + 1), odd);
     for (int p = 0; p < P; ++p) {
       const __m512i high = _mm512_slli_epi32(_mm512_cvtepu16_epi32(odd[p]), 16);
       _mm512_store_si512(to + p * kHalves, _mm512_or_si512(high, _mm512_cvtepu16_epi32(even[p])));
@@ -310,7 +288,6 @@ template <int P, class S>
 void pack(const Job& job, Part& part) {
   const int64_t parities = part.of.corners ? 4 : 1, lines = part.lines<S>();
   part.steps = (part.of.kw * part.of.c + kDepth - 1) / kDepth;
-  part.woven = P == 3 && part.of.c % kTile == 0;
   part.packed = part.memory.reserve<Half>(parities * job.tiles() * lines * part.steps * P * kHalves);
   Half* to = part.packed;
   for (int64_t parity = 0; parity < parities; ++parity)
@@ -319,50 +296,34 @@ void pack(const Job& job, Part& part) {
         pack_line<P, S>(job, part, parity, t, line, to);
 }
 
-// 32 values at k of each line from so many rows, of which `kept` are there and the others are zeros.
-template <int P, class S, bool Woven>
-inline void round_lines(const float* const (&from)[S::Q], const __mmask32 (&kept)[S::Q], int64_t k, Half* to,
-                        int64_t line, int64_t plane, __mmask32 wanted) {
+// 32 values of each line, from k on.
+template <int P, class S>
+inline void round_lines(const float* const (&from)[S::Q], const __mmask32 (&there)[S::Q], int64_t k, __mmask32 wanted,
+                        Half* to, const Patch& patch) {
   __m512 low[S::Q], high[S::Q], a[S::Q], b[S::Q];
   for (int q = 0; q < S::Q; ++q) {
-    const __mmask16 one = kept[q], two = kept[q] >> 16;
-    if (Woven) {
-      auto both = [&](int64_t at) {
-        const __m512 begin = _mm512_castps256_ps512(_mm256_maskz_loadu_ps(one, from[q] + at));
-        return _mm512_insertf32x8(begin, _mm256_maskz_loadu_ps(two, from[q] + at + kTile), 1);
-      };
-      low[q] = both(k);
-      high[q] = both(k + kTile / 2);
-    } else {
-      low[q] = _mm512_maskz_loadu_ps(one, from[q] + k);
-      high[q] = _mm512_maskz_loadu_ps(two, from[q] + k + kTile);
-    }
+    const __mmask32 kept = there[q] & wanted;
+    low[q] = _mm512_maskz_loadu_ps(kept, from[q] + k);
+    high[q] = _mm512_maskz_loadu_ps(kept >> kTile, from[q] + k + kTile);
   }
   to_lines<S>(low, a);
   to_lines<S>(high, b);
   to += k;
-  for (int q = 0; q < S::Q; ++q, to += line) {
-    if constexpr (P == 3) {
-      __m512 x[3], y[3];
-      cut(a[q], x);
-      cut(b[q], y);
-      for (int p = 0; p < P; ++p) _mm512_mask_storeu_epi16(to + p * plane, wanted, upper_halves<Woven>(x[p], y[p]));
-    } else {
-      for (int p = 0; p < P; ++p) {
-        const __m512i both = (__m512i)_mm512_cvtne2ps_pbh(b[q], a[q]);
-        _mm512_mask_storeu_epi16(to + p * plane, wanted, both);
-        if (p + 1 == P) break;
-        a[q] = rest(a[q], widened(_mm512_castsi512_si256(both)));
-        b[q] = rest(b[q], widened(_mm512_extracti64x4_epi64(both, 1)));
-      }
+  for (int q = 0; q < S::Q; ++q, to += patch.row)
+    for (int p = 0; p < P; ++p) {
+      const __m512i both = (__m512i)_mm512_cvtne2ps_pbh(b[q], a[q]);
+      _mm512_mask_storeu_epi16(to + p * patch.plane, wanted, both);
+      if (p + 1 == P) break;
+      a[q] = rest(a[q], widened(_mm512_castsi512_si256(both)));
+      b[q] = rest(b[q], widened(_mm512_extracti64x4_epi64(both, 1)));
     }
-  }
 }
 
 // Lines of the rows from `y` on, so many times R of them, and of columns from patch.x: zeros beyond the image, as P
 // bfloat16 each.
 template <int P, class S>
-void gather(const Part& part, int64_t image, int64_t y, int64_t times, int64_t columns, Memory& memory, Patch& patch) {
+void gather(const Part& part, int64_t image, int64_t y, int64_t times, int64_t columns, Memory& memory,
+            Patch& patch) {
   const Source& s = part.of;
   patch.row = columns * s.c;
   // A block may reach beyond the last pixel: what it finds there is not kept, but must be there to be read.
@@ -390,11 +351,8 @@ void gather(const Part& part, int64_t image, int64_t y, int64_t times, int64_t c
       from[q] = s.image + ((image * s.h + (there[q] ? r : 0)) * s.w + patch.x) * s.c;
     }
     for (int64_t k = begin; k < end; k += 2 * kTile) {
-      const __mmask32 wanted = static_cast<__mmask32>(first(end - k - kTile)) << 16 | first(end - k);
-      __mmask32 kept[S::Q];
-      for (int q = 0; q < S::Q; ++q) kept[q] = there[q] & wanted;
-      (P == 3 && part.woven ? round_lines<P, S, P == 3> : round_lines<P, S, false>)(from, kept, k, to, patch.row,
-                                                                                   patch.plane, wanted);
+      const __mmask32 wanted = static_cast<__mmask32>(first(end - k - kTile)) << kTile | first(end - k);
+      round_lines<P, S>(from, there, k, wanted, to, patch);
     }
   }
 }
@@ -773,8 +731,8 @@ using Bytes = ffi::Buffer<ffi::U8>;
 // Absent parts have no elements. low: n, H/2, W/2, c and its kernel 2, 2, c, 4 * outputs in the order of
 // parities; image: n, H, W, c and its kernel kh, kw, c, outputs.
 ffi::Error convolve(ffi::ThreadPool pool, Floats low, Floats low_kernel, Floats image, Floats kernel, Floats bias,
-                    Floats plus, Bytes gate, Bytes inside, ffi::ResultBuffer<ffi::F32> out, int64_t planes, int64_t bits,
-                    bool relu, int64_t together) try {
+                    Floats plus, Bytes gate, Bytes inside, ffi::ResultBuffer<ffi::F32> out, int64_t planes,
+                    int64_t bits, bool relu, int64_t together) try {
   Job job;
   const auto o = out->dimensions();
   job.n = o[0], job.H = o[1], job.W = o[2], job.outputs = o[3];

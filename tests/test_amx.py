@@ -118,6 +118,41 @@ def test_bias_relu_gate_and_bounds(rows):
 
 
 @needs_amx
+@pytest.mark.parametrize("size", [(1, 5), (18, 131)], ids=str)
+def test_an_addend(size):
+    """With all else that a convolution takes along, its derivatives, and in a batch."""
+    rng = np.random.default_rng(6)
+    image, kernel = drawn(rng, 2, *size, 16), drawn(rng, 3, 3, 16, 35)
+    bias, plus = drawn(rng, 35), drawn(rng, 2, *size, 35)
+    inside = jnp.asarray(rng.random((1, *size)) < 0.7, jnp.uint8)
+    settings = {"planes": 3, "bias": bias, "inside": inside, "relu": True}
+
+    def found(image, plus):
+        return _amx_convolution.convolution(None, None, image, kernel, plus=plus, **settings)
+
+    def expected(image, plus):
+        summed = _amx_convolution.convolution(None, None, image, kernel, planes=3, bias=bias)
+        return jnp.where(inside[..., None] != 0, jax.nn.relu(summed + plus), 0)
+
+    np.testing.assert_array_equal(found(image, plus), expected(image, plus))
+    along = drawn(rng, *image.shape), drawn(rng, *plus.shape)
+    for some in (along, (along[0] * 0, along[1])):
+        ours, theirs = (jax.jvp(f, (image, plus), some)[1] for f in (found, expected))
+        np.testing.assert_allclose(ours, theirs, atol=1e-5)
+    back = drawn(rng, *plus.shape)
+    ours, theirs = (jax.vjp(f, image, plus)[1](back) for f in (found, expected))
+    for our, their in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(our, their, atol=1e-4)
+    only = jax.grad(lambda plus: (found(image, plus) * back).sum())(plus)
+    np.testing.assert_array_equal(only, theirs[1])
+    images, plusses = drawn(rng, 3, *image.shape), drawn(rng, 3, *plus.shape)
+    for axes, given in (((0, 0), (images, plusses)), ((None, 0), (image, plusses))):
+        at_once = jax.vmap(found, axes)(*given)
+        by_each = [found(images[i] if axes[0] == 0 else image, plusses[i]) for i in range(3)]
+        np.testing.assert_array_equal(at_once, jnp.stack(by_each))
+
+
+@needs_amx
 @pytest.mark.parametrize("by", ["inside", "gate"])
 @pytest.mark.parametrize("upsampled", [False, True])
 def test_where_nothing_passes(by, upsampled):

@@ -164,7 +164,7 @@ def test_a_mixer_in_bands_is_the_mixer(name, monkeypatch):
     architecture = mixers.build(name)
     params = jax.tree.map(lambda a: a + 0.05, jax.jit(architecture.init)(jax.random.key(0)))
     mixer = mixers.NetworkMixer(params, architecture)
-    height = 16 * architecture.receptive_radius + 2 * architecture.receptive_radius
+    height = 2 * (16 + 2) * architecture.receptive_radius
     bright = jnp.linspace(0.1, 40, height)[:, None, None]
     x, y = (bright * jnp.asarray(RNG.random((height, 40, 3)), jnp.float32) for _ in range(2))
     variance, divergence = (y - x) ** 2 + 0.01, 0.3 * (y - x) ** 2

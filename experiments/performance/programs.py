@@ -14,7 +14,6 @@ import progden_jax as pd
 from experiments import _common
 from experiments.performance import native
 from progden_jax import mixers
-from progden_jax._bands import in_bands, rows_of
 from progden_jax.denoisers import graph
 from progden_jax.mixers import multiscale
 from progden_jax.mixing import level_of
@@ -121,7 +120,7 @@ def _net(params: Any, seen: Any) -> Any:
     def applied(some: Any) -> Any:
         return net.apply({"params": params}, some)
 
-    return _banded(applied, (seen,), mixers.build("paper").receptive_radius)
+    return mixers.banded(applied, (seen,), mixers.build("paper").receptive_radius)
 
 
 def _shipped_features(mixer: mixers.NetworkMixer, *images: Any) -> Any:
@@ -132,13 +131,7 @@ def _shipped_features(mixer: mixers.NetworkMixer, *images: Any) -> Any:
     def applied(*some: Any) -> Any:
         return multiscale.features(*some, level=level)[0] @ kernel
 
-    return _banded(applied, images, mixer.receptive_radius)
-
-
-def _banded(f: Callable[..., Any], images: tuple[Any, ...], halo: int) -> Any:
-    height, width = images[0].shape[:2]
-    rows = max(rows_of(height, width), 8 * halo)
-    return in_bands(f, images, height, rows=rows, halo=halo)
+    return mixers.banded(applied, images, mixer.receptive_radius)
 
 
 def _shipped_parts(scene: Scene) -> Iterator[tuple[str, float | None, Callable[..., Any], tuple]]:

@@ -35,11 +35,11 @@ def operations(params: Any, pixels: int) -> float:
 
 
 def convolution(
-    batch: int, size: int, channels: int, *, by_xla: bool
+    batch: int, size: int, channels: int, *, by_xla: bool, together: int = _amx.ALIGNED
 ) -> tuple[Any, tuple[Any, ...], float]:
-    """A 3×3 convolution in float32, its arguments and its operations: XLA's own, or the fastest at hand that
-    does them all.
+    """A 3×3 convolution in float32, its arguments and its operations: XLA's own, or the fastest at hand.
 
+    With `together` of 1 it does them all, row by row, where else sums of rows are multiplied.
     Of random values, as a network's are: matrix units run an eighth faster on constants.
     """
     of_image, of_kernel = jax.random.split(jax.random.key(0))
@@ -49,7 +49,7 @@ def convolution(
     @jax.jit
     def run(image: jax.Array, kernel: jax.Array) -> jax.Array:
         if not by_xla and (planes := _amx.planes("highest", kernel, image)):
-            return amx_convolution(None, None, image, kernel, planes=planes, together=1)
+            return amx_convolution(None, None, image, kernel, planes=planes, together=together)
         return jax.lax.conv_general_dilated(
             image, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
         )

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -80,8 +80,7 @@ class NetworkMixer:
         level: Float[Array, ""] | None = None,
     ) -> Float[Array, "h w 3"]:
         """α in [0, 1], (H, W, 3); see `Mixer`."""
-        rows = max(rows_of(*x.shape[:2]), 8 * self.receptive_radius)
-        if level is None and rows < x.shape[0]:
+        if level is None and _rows(x.shape[0], x.shape[1], self.receptive_radius) < x.shape[0]:
             level = level_of(x, inside)
         known = (x, y, variance, divergence, sure, *(() if inside is None else (inside,)))
 
@@ -91,12 +90,7 @@ class NetworkMixer:
 
         # GPUs would else take TF32.
         with jax.default_matmul_precision("highest"):
-            return in_bands(
-                *(applied, known, x.shape[0]),
-                rows=rows,
-                halo=self.receptive_radius,
-                multiple=1 if x.shape[0] % ALIGNED else ALIGNED,
-            )
+            return banded(applied, known, self.receptive_radius)
 
     @property
     def receptive_radius(self) -> int:
@@ -179,6 +173,21 @@ def save_mixer(
         "options": json.dumps(dataclasses.asdict(cast(Any, mixer.architecture))),
     }
     _safetensors.write(path, mixer.params, said, dtype=dtype)
+
+
+def banded(
+    f: Callable[..., Float[Array, "h w d"]], images: tuple[Array, ...], radius: int
+) -> Float[Array, "h w d"]:
+    """``f(*images)``, which sees so far: large images in bands of rows."""
+    height, width = images[0].shape[:2]
+    multiple = 1 if height % ALIGNED else ALIGNED
+    rows = _rows(height, width, radius)
+    return in_bands(f, images, height, rows=rows, halo=radius, multiple=multiple)
+
+
+def _rows(height: int, width: int, radius: int) -> int:
+    """Twice a denoiser's, which takes no more memory: what is linearised is no longer there."""
+    return max(2 * rows_of(height, width), 16 * radius)
 
 
 @functools.lru_cache(maxsize=8)
