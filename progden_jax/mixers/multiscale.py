@@ -183,12 +183,13 @@ def features(
     closed = x
     for w in WINDOWS:
         scales = () if w == 15 else ("scales",)
-        alpha = jnp.clip(mean(useful, w) / (away[w] + least), 0, 1)
+        changed = mean(divergence, w)
+        alpha = jnp.clip((noise[w] - changed) / (away[w] + least), 0, 1)
         closed = alpha if w == 15 else closed
         show(alpha, *scales)
         show(0.3 * jnp.log((away[w] + least) / (noise[w] + least)), *scales)
         if w in (3, 15):
-            slope = jnp.clip(mean(divergence, w) / (noise[w] + least), -1, 2)
+            slope = jnp.clip(changed / (noise[w] + least), -1, 2)
             show(slope, "divergence", *scales)
     show(0.2 * jnp.log((squared + least) / (variance + least)))
     show(jnp.clip(divergence / (variance + least), -1, 2), "divergence")
