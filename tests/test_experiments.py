@@ -536,13 +536,20 @@ def test_times_of_denoisers(command, tiny):
 
 def test_convolutions(command):
     """Every way to the convolution gives the same, Winograd's too, in bfloat16 to its digits."""
-    printed = command(convolutions, "--shapes", "8x8x8", "--repeats", 1)
+    words = ("--shapes", "8x8x8", "--repeats", 1, "--net", "24x16")
+    printed = command(convolutions, *words)
     off = {row[1]: row[5] for row in cells(printed, "8x8x8")}
     if _amx.available():
         assert float(off["AMX, 3 bfloat16 a value"]) < 1e-6
     assert float(off["Winograd"]) < 1e-5
     assert 1e-4 < float(off["direct, bfloat16"]) < 1e-2
     assert off["product alone"] == ""
+    by = {row[1]: [float(n) for n in row[2:]] for row in cells(printed, "24x16")}
+    names = {"AMX, rows summed", "AMX, row by row"} if _amx.available() else {"XLA"}
+    assert set(by) == names
+    for ms, speed, ratio in by.values():
+        products = 18 * 25 * 48 + 4 * 9 * 48**2 + 9 * 48 * 9
+        assert ratio == pytest.approx(1e6 * ms * speed / (2 * products * 24 * 16), rel=0.1)
 
 
 def test_performance(command, monkeypatch, tiny, tmp_path):

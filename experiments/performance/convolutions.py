@@ -1,14 +1,16 @@
 """Other ways to a 3×3 convolution on this machine, against XLA's own: AMX, Winograd's, half precision.
 
-    python -m experiments.performance.convolutions [--shapes 512x64x64 512x32x32]
+    python -m experiments.performance.convolutions [--shapes 512x64x64 512x32x32] [--net 1920x1080]
 
 Programs take turns; times are the least of many, by the clock. Winograd's F(4×4, 3×3) (Lavin and Gray
 2016) has a quarter of the products, as 36 matrix products between two linear transforms; its kernels are
-transformed beforehand.
+transformed beforehand. Then the paper's mixing net against its operations at the speed of convolutions that
+are called again and again right before and after it (in `run` they are called once in a round): medians.
 """
 
 import argparse
 import functools
+import statistics
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -19,9 +21,13 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from experiments import _common
+from experiments.performance.programs import mixing_net
+from experiments.performance.run import size_of
+from experiments.performance.step import convolution as large_convolution
 from experiments.performance.step import seconds
-from progden_jax import _amx
+from progden_jax import _amx, mixers
 from progden_jax._amx_convolution import convolution
+from progden_jax.mixing import FEATURES
 
 INPUT = (
     (4, 0, -5, 0, 1, 0),
@@ -52,6 +58,9 @@ SWITCHES = {
     },
 }
 """Libraries that XLA can be asked to use."""
+
+_AROUND = 4
+"""Calls of a convolution before the net, and after it."""
 
 
 def direct(image: Float[Array, "h w c"], kernel: Float[Array, "3 3 c k"]) -> Float[Array, "h w k"]:
@@ -140,12 +149,42 @@ def programs(size: int, channels: int, outputs: int) -> dict[str, tuple[Callable
     }
 
 
+def net_by_operations(height: int, width: int, repeats: int) -> list[tuple[object, ...]]:
+    """By each convolution of 96 channels: its speed, and the net's time over its operations' at it."""
+    paper = mixers.build("paper")
+    params = jax.jit(paper.init)(jax.random.key(0))
+    seen = jax.random.gamma(jax.random.key(1), 1.0, (height, width, FEATURES))
+    net = jax.jit(mixing_net)
+    operations = 2.0 * height * width * sum(a.size for a in jax.tree.leaves(params) if a.ndim == 4)
+    ways = (
+        {"AMX, rows summed": _amx.ALIGNED, "AMX, row by row": 1} if _amx.available() else {"XLA": 1}
+    )
+    found = []
+    for name, together in ways.items():
+        run, images, count = large_convolution(1, 512, 96, by_xla=False, together=together)
+        jax.block_until_ready((net(params, seen), run(*images)))
+        times, speeds = [], []
+        for _ in range(repeats):
+            before = [seconds(functools.partial(run, *images)) for _ in range(_AROUND)]
+            times.append(seconds(functools.partial(net, params, seen)))
+            after = [seconds(functools.partial(run, *images)) for _ in range(_AROUND)]
+            speeds.append(count / statistics.mean(before + after))
+        ratios = [time * speed / operations for time, speed in zip(times, speeds, strict=True)]
+        ms, gflops = 1e3 * statistics.median(times), statistics.median(speeds) / 1e9
+        shown = (f"{ms:.1f}", f"{gflops:.0f}", f"{statistics.median(ratios):.2f}")
+        found.append((f"{width}x{height}", name, *shown))
+    return found
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     shapes = ["512x64x64", "512x32x32", "256x96x96"]
     parser.add_argument("--shapes", nargs="+", default=shapes, help="SIDExCHANNELSxOUTPUTS")
+    parser.add_argument(
+        "--net", default="1920x1080", help="WIDTHxHEIGHT that the mixing net is run at"
+    )
     parser.add_argument("--repeats", type=int, default=8)
     arguments = parser.parse_args()
     print(_common.machine() + "\n", flush=True)
@@ -173,7 +212,9 @@ def main() -> None:
                 )
             )
     header = ("shape", "program", "ms", "direct = 1", "GFLOP/s of the direct's", "off")
-    print(_common.markdown(header, rows))
+    print(_common.markdown(header, rows) + "\n", flush=True)
+    header = ("mixing net at", "convolution", "net, ms", "GFLOP/s", "net / operations")
+    print(_common.markdown(header, net_by_operations(*size_of(arguments.net), arguments.repeats)))
 
 
 if __name__ == "__main__":

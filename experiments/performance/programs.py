@@ -97,7 +97,7 @@ def parts(scene: Scene, against: Sequence[str]) -> Iterator[Program]:
     ours = (
         (FORWARD, scene.operations, lambda f, x: f(x), (scene.f, scene.x)),
         (FEATURES, None, pd.mixing_features, (*images, scene.risk)),
-        (NET, scene.operations_of(scene.paper), _net, (scene.paper.params, seen)),
+        (NET, scene.operations_of(scene.paper), mixing_net, (scene.paper.params, seen)),
         (BOUND, None, pd.t_bound, (scene.alpha, *images)),
         *_shipped_parts(scene),
     )
@@ -113,7 +113,7 @@ def parts(scene: Scene, against: Sequence[str]) -> Iterator[Program]:
         yield from _Torch(scene).parts(answers)
 
 
-def _net(params: Any, seen: Any) -> Any:
+def mixing_net(params: Any, seen: Any) -> Any:
     """As the pipeline runs it: large images in bands of rows."""
     net = pd.MixingNet()
 
