@@ -406,8 +406,7 @@ class Finishing {
   void begin(const Job& job, const Block<S>& block, const float* sums) {
     job_ = &job, block_ = block, sums_ = sums;
     half_ = -1, pixel_ = block.pixels;
-    halves_ = job.outputs - block.at.t * kTile > kTile ? 2 : 1;
-    left_ = halves_ * block.pixels;
+    left_ = (job.outputs - block.at.t * kTile > kTile ? 2 : 1) * block.pixels;
     plain_ = block.rows == S::R;
     for (int64_t r = 0; r < block.rows; ++r) plain_ = plain_ && !block.masks[r].gate && !block.masks[r].inside;
   }
@@ -485,7 +484,7 @@ class Finishing {
   const Job* job_;
   Block<S> block_;
   const float* sums_;
-  int64_t half_, halves_, pixel_, left_ = 0, at_, next_, row_;
+  int64_t half_, pixel_, left_ = 0, at_, next_, row_;
   bool plain_;
   __mmask16 wanted_;
   __m512 bias_;
