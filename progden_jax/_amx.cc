@@ -225,8 +225,22 @@ struct Part {
   int64_t every, offset;      // Cells at y, of parity i, begin at the source's row y * every + offset + i.
   std::vector<int64_t> taps;  // rows of the kernel
   Memory memory = {};
-  Half* packed = nullptr;     // [parity][16 outputs][line][step][plane] tiles
-  int64_t steps = 0;          // of a row of taps
+  Half* packed = nullptr;     // [parity][16 outputs][line][tap][step][plane] tiles
+  // Multiples of 16 channels: taps have steps of their own, and two values 16 channels apart share 32 bits. Of 16
+  // channels that would fill half a step two planes do, which gives two products.
+  bool woven = false, half = false;
+  int64_t across = 1, steps = 0, size = 0;  // taps with steps of their own; full steps; halves of a line
+
+  template <int P>
+  void plan() {
+    woven = P == 3 && of.c % kTile == 0;
+    half = woven && of.c % kDepth;
+    across = woven ? of.kw : 1;
+    steps = woven ? of.c / kDepth : (of.kw * of.c + kDepth - 1) / kDepth;
+    size = across * (steps + half) * P * kHalves;
+  }
+
+  int64_t begun() const { return across * (steps + half); }
 
   template <class S>
   int64_t lines() const { return S::kSummed ? taps.size() : S::Q; }
@@ -250,7 +264,8 @@ struct Job {
 
 struct Patch {
   Half* data;
-  int64_t x, row, plane;  // its first column; halves from line to line and plane to plane
+  int64_t x, row, plane;     // its first column; halves from line to line and plane to plane,
+  int64_t pixel, step;       // pixel to pixel and step to step
 };
 
 // Of one line: outputs from that tile on, for a pair of inputs one after the other.
@@ -273,26 +288,39 @@ void pack_line(const Job& job, const Part& part, int64_t parity, int64_t t, int6
       return sum;
     }
   };
-  for (int64_t k = 0; k < part.steps * kDepth; k += 2, to += (k % kDepth ? kDepth : kDepth + (P - 1) * kHalves)) {
-    __m256i even[P], odd[P];
-    split<P>(value(k), even);
-    split<P>(value(k + 1), odd);
-    for (int p = 0; p < P; ++p) {
-      const __m512i high = _mm512_slli_epi32(_mm512_cvtepu16_epi32(odd[p]), 16);
-      _mm512_store_si512(to + p * kHalves, _mm512_or_si512(high, _mm512_cvtepu16_epi32(even[p])));
+  auto both = [](__m256i low, __m256i high) {
+    return _mm512_or_si512(_mm512_slli_epi32(_mm512_cvtepu16_epi32(high), 16), _mm512_cvtepu16_epi32(low));
+  };
+  int64_t k = 0;
+  for (int64_t tap = 0; tap < part.across; ++tap) {
+    for (int64_t step = 0; step < part.steps; ++step, k += kDepth, to += P * kHalves)
+      for (int64_t row = 0; row < kTile; ++row) {
+        __m256i low[P], high[P];
+        split<P>(value(part.woven ? k + row : k + 2 * row), low);
+        split<P>(value(part.woven ? k + row + kTile : k + 2 * row + 1), high);
+        for (int p = 0; p < P; ++p) _mm512_store_si512(to + p * kHalves + row * kDepth, both(low[p], high[p]));
+      }
+    if (!part.half) continue;
+    for (int64_t row = 0; row < kTile; ++row, ++k, to += kDepth) {
+      __m256i planes[3];
+      split<3>(value(k), planes);
+      _mm512_store_si512(to, both(planes[2], planes[0]));
+      _mm512_store_si512(to + kHalves, both(planes[0], planes[1]));
+      _mm512_store_si512(to + 2 * kHalves, both(planes[1], planes[0]));
     }
+    to += 2 * kHalves;
   }
 }
 
 template <int P, class S>
 void pack(const Job& job, Part& part) {
   const int64_t parities = part.of.corners ? 4 : 1, lines = part.lines<S>();
-  part.steps = (part.of.kw * part.of.c + kDepth - 1) / kDepth;
-  part.packed = part.memory.reserve<Half>(parities * job.tiles() * lines * part.steps * P * kHalves);
+  part.plan<P>();
+  part.packed = part.memory.reserve<Half>(parities * job.tiles() * lines * part.size);
   Half* to = part.packed;
   for (int64_t parity = 0; parity < parities; ++parity)
     for (int64_t t = 0; t < job.tiles(); ++t)
-      for (int64_t line = 0; line < lines; ++line, to += part.steps * P * kHalves)
+      for (int64_t line = 0; line < lines; ++line, to += part.size)
         pack_line<P, S>(job, part, parity, t, line, to);
 }
 
@@ -308,7 +336,6 @@ inline void round_lines(const float* const (&from)[S::Q], const __mmask32 (&ther
   }
   to_lines<S>(low, a);
   to_lines<S>(high, b);
-  to += k;
   for (int q = 0; q < S::Q; ++q, to += patch.row)
     for (int p = 0; p < P; ++p) {
       const __m512i both = (__m512i)_mm512_cvtne2ps_pbh(b[q], a[q]);
@@ -319,30 +346,77 @@ inline void round_lines(const float* const (&from)[S::Q], const __mmask32 (&ther
     }
 }
 
+inline __m512i upper() { return _mm512_set1_epi32(0xffff0000); }
+
+// What cutting x off after 8 of its 24 bits leaves: three times 8 bits are all of it.
+inline __m512 uncut(__m512 x) { return rest(x, (__m512)_mm512_and_si512((__m512i)x, upper())); }
+
+// The upper halves of both: low >> 16 | high & upper.
+inline __m512i paired(__m512 low, __m512 high) {
+  return _mm512_ternarylogic_epi32(upper(), (__m512i)high, _mm512_srli_epi32((__m512i)low, 16), 0xea);
+}
+
+// 32 values of each line, from k on.
+template <class S>
+inline void weave(const float* const (&from)[S::Q], const __mmask32 (&there)[S::Q], int64_t k, Half* to,
+                  const Patch& patch) {
+  __m512 low[S::Q], high[S::Q], a[S::Q], b[S::Q];
+  for (int q = 0; q < S::Q; ++q) {
+    low[q] = _mm512_maskz_loadu_ps(there[q], from[q] + k);
+    high[q] = _mm512_maskz_loadu_ps(there[q], from[q] + k + kTile);
+  }
+  to_lines<S>(low, a);
+  to_lines<S>(high, b);
+  for (int q = 0; q < S::Q; ++q, to += patch.row)
+    for (int p = 0; p < 3; ++p) {
+      _mm512_store_si512(to + p * kDepth, paired(a[q], b[q]));
+      if (p == 2) break;
+      a[q] = uncut(a[q]), b[q] = uncut(b[q]);
+    }
+}
+
+// 16 values of each line, from k on: planes 1 and 0, and 0 and 2.
+template <class S>
+inline void weave_half(const float* const (&from)[S::Q], const __mmask32 (&there)[S::Q], int64_t k, Half* to,
+                       const Patch& patch) {
+  __m512 values[S::Q], a[S::Q];
+  for (int q = 0; q < S::Q; ++q) values[q] = _mm512_maskz_loadu_ps(there[q], from[q] + k);
+  to_lines<S>(values, a);
+  for (int q = 0; q < S::Q; ++q, to += patch.row) {
+    const __m512 second = uncut(a[q]), third = uncut(second);
+    _mm512_store_si512(to, paired(second, a[q]));
+    _mm512_store_si512(to + kDepth, paired(a[q], third));
+  }
+}
+
 // Lines of the rows from `y` on, so many times R of them, and of columns from patch.x: zeros beyond the image, as P
 // bfloat16 each.
 template <int P, class S>
 void gather(const Part& part, int64_t image, int64_t y, int64_t times, int64_t columns, Memory& memory,
             Patch& patch) {
   const Source& s = part.of;
-  patch.row = columns * s.c;
+  patch.pixel = part.woven ? (3 * part.steps + 2 * part.half) * kDepth : s.c;
+  patch.step = part.woven ? 3 * kDepth : kDepth;
+  patch.row = columns * patch.pixel;
   // A block may reach beyond the last pixel: what it finds there is not kept, but must be there to be read.
-  const int64_t beyond = (2 * kPixels + s.kw) * s.c + 2 * kDepth, lines = times * S::Q;
-  patch.plane = (lines * patch.row + beyond + kDepth - 1) / kDepth * kDepth;
-  patch.data = memory.reserve<Half>(P * patch.plane);
-  const int64_t begin = std::clamp<int64_t>(-patch.x, 0, columns) * s.c;
-  const int64_t end = std::max(std::clamp<int64_t>(s.w - patch.x, 0, columns) * s.c, begin);
-  for (int p = 0; p < P; ++p)
-    std::memset(patch.data + p * patch.plane + lines * patch.row, 0,
-                (patch.plane - lines * patch.row) * sizeof(Half));
+  const int64_t beyond = (2 * kPixels + s.kw) * patch.pixel + 2 * kDepth, lines = times * S::Q;
+  const int64_t size = (lines * patch.row + beyond + kDepth - 1) / kDepth * kDepth;
+  const int64_t planes = part.woven ? 1 : P;
+  patch.plane = part.woven ? kDepth : size;
+  patch.data = memory.reserve<Half>(planes * size);
+  const int64_t begin = std::clamp<int64_t>(-patch.x, 0, columns);
+  const int64_t end = std::max(std::clamp<int64_t>(s.w - patch.x, 0, columns), begin);
+  auto clear = [&](int64_t from, int64_t count) {
+    for (int64_t p = 0; p < planes; ++p) std::memset(patch.data + p * size + from, 0, count * sizeof(Half));
+  };
+  if (!part.woven) clear(lines * patch.row, size - lines * patch.row);
   for (int64_t n = 0; n < times; ++n) {
     Half* to = patch.data + n * S::Q * patch.row;
-    for (int q = 0; q < S::Q; ++q)
-      for (int p = 0; p < P; ++p) {
-        Half* line = to + q * patch.row + p * patch.plane;
-        std::memset(line, 0, begin * sizeof(Half));
-        std::memset(line + end, 0, (patch.row - end) * sizeof(Half));
-      }
+    for (int q = 0; q < S::Q; ++q) {
+      const int64_t line = to + q * patch.row - patch.data;
+      clear(line, begin * patch.pixel);
+      clear(line + end * patch.pixel, patch.row - end * patch.pixel);
+    }
     const float* from[S::Q];
     __mmask32 there[S::Q];
     for (int q = 0; q < S::Q; ++q) {
@@ -350,9 +424,19 @@ void gather(const Part& part, int64_t image, int64_t y, int64_t times, int64_t c
       there[q] = r >= 0 && r < s.h ? ~0u : 0;
       from[q] = s.image + ((image * s.h + (there[q] ? r : 0)) * s.w + patch.x) * s.c;
     }
-    for (int64_t k = begin; k < end; k += 2 * kTile) {
-      const __mmask32 wanted = static_cast<__mmask32>(first(end - k - kTile)) << kTile | first(end - k);
-      round_lines<P, S>(from, there, k, wanted, to, patch);
+    if (part.woven) {
+      for (int64_t x = begin; x < end; ++x) {
+        Half* pixel = to + x * patch.pixel;
+        for (int64_t k = 0; k < part.steps; ++k)
+          weave<S>(from, there, x * s.c + k * kDepth, pixel + k * patch.step, patch);
+        if (part.half) weave_half<S>(from, there, (x + 1) * s.c - kTile, pixel + part.steps * patch.step, patch);
+      }
+      continue;
+    }
+    for (int64_t k = begin * s.c; k < end * s.c; k += kDepth) {
+      const int64_t left = end * s.c - k;
+      const __mmask32 wanted = static_cast<__mmask32>(first(left - kTile)) << kTile | first(left);
+      round_lines<P, S>(from, there, k, wanted, to + k, patch);
     }
   }
 }
@@ -398,6 +482,12 @@ struct Block {
   int64_t rows, pixels;
   Mask masks[S::R];
 };
+
+// Whole lines around the caches: what is there need not be read first, and is not wanted again before all is written.
+inline void write(float* to, __mmask16 wanted, __m512 value) {
+  if (wanted == 0xffff && reinterpret_cast<uintptr_t>(to) % 64 == 0) _mm512_stream_ps(to, value);
+  else _mm512_mask_storeu_ps(to, wanted, value);
+}
 
 // Writing a block's sums through bias, addend, ReLU, gate and bounds, some pixels by 16 outputs by R rows at a time.
 template <class S>
@@ -463,7 +553,7 @@ class Finishing {
         }
         // Of NaN the second is taken.
         if (relu) value = _mm512_max_ps(value, zero);
-        _mm512_mask_storeu_ps(out + r * row, wanted, value);
+        write(out + r * row, wanted, value);
       }
     }
   }
@@ -513,35 +603,53 @@ inline void multiply() {
 
 // Small products first. Between them vector units write the block before.
 template <int P, int M, int N, class S>
-inline void add_lines(const Half* pixels, int64_t stride, const Patch& patch, const Half* kernels, int64_t next,
-                      int64_t lines, int64_t steps, Finishing<S>& before, int64_t each) {
+inline void add_lines(const Part& part, const Half* pixels, int64_t stride, const Patch& patch, const Half* kernels,
+                      int64_t next, int64_t lines, Finishing<S>& before, int64_t each) {
   alignas(64) float unused[kTile * kTile];
+  int64_t done = 0;
+  auto between = [&] {
+    // Kept by nobody: without it storing the sums takes 0.3 us longer, as after any 130 products or more.
+    if (++done % 4 == 0) _tile_stored(6, unused, 64);
+    for (int64_t n = 0; n < each; ++n) before.advance();
+  };
   for (int64_t line = 0; line < lines; ++line, pixels += patch.row)
-    for (int64_t k = 0; k < steps; ++k, kernels += P * kHalves) {
-      const Half* at = pixels + k * kDepth;
-      if (P == 3) {
-        load_pixels<M>(at + 2 * patch.plane, stride);
+    for (int64_t tap = 0; tap < part.across; ++tap) {
+      const Half* at = pixels + tap * patch.pixel;
+      for (int64_t k = 0; k < part.steps; ++k, at += patch.step, kernels += P * kHalves) {
+        if (P == 3) {
+          load_pixels<M>(at + 2 * patch.plane, stride);
+          load_kernels<N>(kernels, next);
+          multiply<M, N>();
+        }
+        if (P >= 2) {
+          load_pixels<M>(at + patch.plane, stride);
+          if (P == 2) load_kernels<N>(kernels, next);
+          multiply<M, N>();
+          load_kernels<N>(kernels + kHalves, next);
+          if (P == 3) multiply<M, N>();
+        }
+        load_pixels<M>(at, stride);
+        if (P >= 2) multiply<M, N>();
+        if (P == 3) {
+          load_kernels<N>(kernels + 2 * kHalves, next);
+          multiply<M, N>();
+        }
         load_kernels<N>(kernels, next);
         multiply<M, N>();
+        between();
       }
-      if (P >= 2) {
-        load_pixels<M>(at + patch.plane, stride);
-        if (P == 2) load_kernels<N>(kernels, next);
+      if (P == 3 && part.half) {
+        load_pixels<M>(at + kDepth, stride);
+        load_kernels<N>(kernels, next);
         multiply<M, N>();
+        load_pixels<M>(at, stride);
         load_kernels<N>(kernels + kHalves, next);
-        if (P == 3) multiply<M, N>();
-      }
-      load_pixels<M>(at, stride);
-      if (P >= 2) multiply<M, N>();
-      if (P == 3) {
+        multiply<M, N>();
         load_kernels<N>(kernels + 2 * kHalves, next);
         multiply<M, N>();
+        kernels += P * kHalves;
+        between();
       }
-      load_kernels<N>(kernels, next);
-      multiply<M, N>();
-      // Kept by nobody: without it storing the sums takes 0.3 us longer, as after any 130 products or more.
-      if (k % 4 == 3) _tile_stored(6, unused, 64);
-      for (int64_t n = 0; n < each; ++n) before.advance();
     }
 }
 
@@ -551,7 +659,7 @@ void add_block(const Job& job, const Patch* patches, int64_t line, const Place& 
                Finishing<S>& before) {
   constexpr int64_t kRow = 2 * kTile;
   int64_t steps = 0;
-  for (const Part& part : job.parts) steps += part.lines<S>() * part.steps;
+  for (const Part& part : job.parts) steps += part.lines<S>() * part.begun();
   const int64_t each = (before.left() + steps - 1) / steps;
   for (int q = 0; q < S::Q; ++q, sums += kSums) {
     _tile_zero(0);
@@ -562,13 +670,13 @@ void add_block(const Job& job, const Patch* patches, int64_t line, const Place& 
       const Part& part = job.parts[n];
       const Source& s = part.of;
       const Patch& patch = patches[n];
-      const int64_t lines = part.lines<S>(), tile = part.steps * P * kHalves;
+      const int64_t lines = part.lines<S>();
       const int64_t parity = s.corners ? 2 * at.i + at.j : 0;
       const int64_t x = s.corners ? at.x + at.j - 1 : at.x * job.step + at.j - s.kw / 2;
-      const Half* pixels = patch.data + (line + q) * patch.row + (x - patch.x) * s.c;
-      const Half* kernels = part.packed + ((parity * job.tiles() + at.t) * lines + q) * tile;
-      add_lines<P, M, N, S>(pixels, s.corners ? s.c : job.step * s.c, patch, kernels, lines * tile,
-                            S::kSummed ? lines : 1, part.steps, before, each);
+      const Half* pixels = patch.data + (line + q) * patch.row + (x - patch.x) * patch.pixel;
+      const Half* kernels = part.packed + ((parity * job.tiles() + at.t) * lines + q) * part.size;
+      add_lines<P, M, N, S>(part, pixels, (s.corners ? 1 : job.step) * patch.pixel, patch, kernels, lines * part.size,
+                            S::kSummed ? lines : 1, before, each);
     }
     _tile_stored(0, sums, kRow * sizeof(float));
     if (N > 1) _tile_stored(1, sums + kTile, kRow * sizeof(float));
@@ -646,6 +754,7 @@ void task(const Job& job, int64_t index) {
           }
   }
   before.all();
+  _mm_sfence();
   _tile_release();
 }
 
