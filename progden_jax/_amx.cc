@@ -39,7 +39,7 @@ constexpr int64_t kDepth = 32;      // bfloat16 in one of its rows
 constexpr int64_t kHalves = 512;    // bfloat16 in a tile
 constexpr int64_t kPixels = 32;     // of a block, by as many outputs: four tiles of sums
 constexpr int64_t kSums = 4 * kTile * kTile + kTile;  // of a line of a block; all 4 KiB apart would evict each other
-constexpr int64_t kPatch = 1 << 19; // bytes that a task's input may take, of a second-level cache's 2 MiB
+constexpr int64_t kPatch = 1 << 19; // bytes that what is gathered may take, of a second-level cache's 2 MiB
 
 struct Free {
   void operator()(void* memory) const { std::free(memory); }
@@ -258,6 +258,7 @@ struct Job {
   int64_t n, H, W, outputs;
   int64_t step = 1;                 // 2 where a source has corners: even and odd pixels have taps of their own
   int64_t rows = 0, columns = 0;    // of a task, in cells of step by step pixels
+  int64_t height = 0;               // rows of those that are gathered at a time
 
   int64_t tiles() const { return (outputs + kTile - 1) / kTile; }
 };
@@ -685,6 +686,14 @@ void add_block(const Job& job, const Patch* patches, int64_t line, const Place& 
   }
 }
 
+template <int P, class S>
+void add_any(const Job& job, const Patch* patches, int64_t line, const Block<S>& block, float* sums,
+             Finishing<S>& before) {
+  const bool one = block.pixels <= kTile, last = job.tiles() - block.at.t == 1;
+  (one ? last ? add_block<P, 1, 1, S> : add_block<P, 1, 2, S>
+       : last ? add_block<P, 2, 1, S> : add_block<P, 2, 2, S>)(job, patches, line, block.at, sums, before);
+}
+
 void zero(const Job& job, const Place& at, int64_t rows, int64_t pixels) {
   const int64_t x = at.x * job.step + at.j, output = at.t * kTile;
   const int64_t bytes = std::min(2 * kTile, job.outputs - output) * sizeof(float);
@@ -726,32 +735,32 @@ void task(const Job& job, int64_t index) {
   Finishing<S> before;
   int64_t turn = 0;
   for (at.i = 0; at.i < job.step; ++at.i) {
-    bool gathered = false;
-    for (at.j = 0; at.j < job.step; ++at.j)
-      for (at.t = 0; at.t < job.tiles(); at.t += 2)
-        for (at.y = y0; at.y < y1; at.y += S::R)
-          for (at.x = x0; at.x < x1; at.x += kPixels) {
-            Block<S> block{at, std::min<int64_t>(S::R, y1 - at.y), std::min(kPixels, x1 - at.x), {}};
-            const bool one = block.pixels <= kTile, last = job.tiles() - at.t == 1;
-            bool any = false;
-            for (int64_t r = 0; r < block.rows; ++r) {
-              block.masks[r] = Mask(job, at, r);
-              any = block.masks[r].any(job, at, block.pixels) || any;
+    for (int64_t y = y0; y < y1; y += job.height) {
+      const int64_t end = std::min(y1, y + job.height);
+      bool gathered = false;
+      for (at.j = 0; at.j < job.step; ++at.j)
+        for (at.t = 0; at.t < job.tiles(); at.t += 2)
+          for (at.y = y; at.y < end; at.y += S::R)
+            for (at.x = x0; at.x < x1; at.x += kPixels) {
+              Block<S> block{at, std::min<int64_t>(S::R, end - at.y), std::min(kPixels, x1 - at.x), {}};
+              bool any = false;
+              for (int64_t r = 0; r < block.rows; ++r) {
+                block.masks[r] = Mask(job, at, r);
+                any = block.masks[r].any(job, at, block.pixels) || any;
+              }
+              // Padding around an image is all zeros, and costs no more than writing them.
+              if (!any) {
+                zero(job, at, block.rows, block.pixels);
+                continue;
+              }
+              if (!gathered) gather_all<P, S>(job, at, y, end, x0, x1, memory, patches);
+              gathered = true;
+              add_any<P, S>(job, patches, (at.y - y) / S::R * S::Q, block, sums[turn], before);
+              before.all();
+              before.begin(job, block, sums[turn]);
+              turn ^= 1;
             }
-            // Padding around an image is all zeros, and costs no more than writing them.
-            if (!any) {
-              zero(job, at, block.rows, block.pixels);
-              continue;
-            }
-            if (!gathered) gather_all<P, S>(job, at, y0, y1, x0, x1, memory, patches);
-            gathered = true;
-            const int64_t line = (at.y - y0) / S::R * S::Q;
-            (one ? last ? add_block<P, 1, 1, S> : add_block<P, 1, 2, S>
-                 : last ? add_block<P, 2, 1, S> : add_block<P, 2, 2, S>)(job, patches, line, at, sums[turn], before);
-            before.all();
-            before.begin(job, block, sums[turn]);
-            turn ^= 1;
-          }
+    }
   }
   before.all();
   _mm_sfence();
@@ -792,17 +801,18 @@ void run(Job& job, ffi::ThreadPool& pool) {
   for (Part& part : job.parts) pack<P, S>(job, part);
   job.rows = kTile / job.step;
   job.columns = 4 * kPixels;
+  job.height = S::kSummed ? job.rows : S::R;
   auto bytes = [&] {
     int64_t total = 0;
     for (const Part& part : job.parts) {
       const Source& s = part.of;
-      const int64_t lines = S::kSummed ? job.rows + part.taps.size() - 1 : job.rows / S::R * S::Q;
+      const int64_t lines = S::kSummed ? job.height + part.taps.size() - 1 : S::Q;
       total += lines * (job.columns * (s.corners ? 1 : job.step) + s.kw) * s.c * P * sizeof(Half);
     }
     return total;
   };
   while (job.columns > kPixels && bytes() > kPatch) job.columns /= 2;
-  while (job.rows > S::R && bytes() > kPatch) job.rows /= 2;
+  while (job.height > S::R && bytes() > kPatch) job.rows = job.height /= 2;
   const int64_t h = job.H / job.step, w = job.W / job.step;
   const int64_t count = job.n * ((h + job.rows - 1) / job.rows) * ((w + job.columns - 1) / job.columns);
   in_parallel(pool, count, [&job](int64_t index) { task<P, S>(job, index); });

@@ -25,6 +25,9 @@ _ABSENT: tuple[Any, ...] = (
 )
 """What stands for an operand that is not given."""
 
+_PLUS = 5
+"""Which operand is added."""
+
 _primitive = jex.core.Primitive("amx_convolution")
 
 
@@ -79,7 +82,10 @@ def convolution(
 
 
 def _call(*operands: Array, shape: Sequence[int], relu: bool, **numbers: int) -> Array:
-    call = jax.ffi.ffi_call(_amx.TARGET, jax.ShapeDtypeStruct(tuple(shape), jnp.float32))
+    # What is added may be overwritten, as each value is read once, before the sum is put there.
+    aliases = {_PLUS: 0} if operands[_PLUS].size else {}
+    out = jax.ShapeDtypeStruct(tuple(shape), jnp.float32)
+    call = jax.ffi.ffi_call(_amx.TARGET, out, input_output_aliases=aliases)
     return call(
         *operands, relu=np.bool_(relu), **{name: np.int64(n) for name, n in numbers.items()}
     )

@@ -50,6 +50,9 @@ def off(found, expected):
         ((5, 17), 9, 33, 3),
         ((3, 33), 13, 3, 5),
         ((18, 131), 48, 80, 3),
+        ((21, 259), 32, 40, 3),
+        ((9, 66), 80, 16, 3),
+        ((6, 140), 16, 20, 5),
         ((2, 40), 7, 16, 7),
         ((33, 16), 1, 64, 3),
         ((4, 200), 700, 5, 1),
@@ -57,7 +60,7 @@ def off(found, expected):
     ids=str,
 )
 def test_convolution(size, channels, outputs, edge):
-    """Sizes and channels that fill no tile; of a patch larger than its share of the cache."""
+    """Sizes and channels that fill no tile, or half of one; a patch larger than its share of the cache."""
     rng = np.random.default_rng(0)
     image = drawn(rng, 2, *size, channels)
     kernel = drawn(rng, edge, edge, channels, outputs)
@@ -82,11 +85,11 @@ def plain(image, kernel):
 
 
 @needs_amx
-@pytest.mark.parametrize("skip", [0, 9])
-def test_of_pixels_that_are_repeated(skip):
+@pytest.mark.parametrize(("below", "skip"), [(20, 0), (20, 9), (48, 32), (64, 3)])
+def test_of_pixels_that_are_repeated(below, skip):
     rng = np.random.default_rng(1)
-    low, image = drawn(rng, 2, 9, 35, 20), drawn(rng, 2, 18, 70, skip)
-    kernel = drawn(rng, 3, 3, 20 + skip, 37)
+    low, image = drawn(rng, 2, 9, 35, below), drawn(rng, 2, 18, 70, skip)
+    kernel = drawn(rng, 3, 3, below + skip, 37)
     expected = dense(np.concatenate([repeated(low), image], -1), kernel)
     assert off(upsampled_convolution(low, image, kernel, "highest"), expected) < 5e-7
     assert 1e-7 < off(upsampled_convolution(low, image, kernel, "high"), expected) < 2e-5
@@ -153,14 +156,41 @@ def test_an_addend(size):
 
 
 @needs_amx
+def test_an_addend_is_overwritten_where_nobody_needs_it():
+    rng = np.random.default_rng(7)
+    image, kernel = drawn(rng, 1, 60, 70, 32), drawn(rng, 3, 3, 32, 32)
+
+    def layer(image, **settings):
+        return _amx_convolution.convolution(None, None, image, kernel, planes=3, **settings)
+
+    def chain(image):
+        first = layer(image)
+        return layer(layer(first), plus=first), first
+
+    last, first = chain(image)
+    before = np.array(first)
+    np.testing.assert_array_equal(layer(layer(first), plus=first), last)
+    np.testing.assert_array_equal(first, before)
+    both, alone = jax.jit(chain), jax.jit(lambda image: chain(image)[0])
+    for found, expected in zip(both(image), (last, first), strict=True):
+        np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(alone(image), last)
+    needed = alone.lower(image).compile().memory_analysis()
+    assert needed.temp_size_in_bytes < 2.5 * image.nbytes
+
+
+@needs_amx
 @pytest.mark.parametrize("by", ["inside", "gate"])
 @pytest.mark.parametrize("upsampled", [False, True])
-def test_where_nothing_passes(by, upsampled):
+@pytest.mark.parametrize("channels", [8, 48])
+def test_where_nothing_passes(by, upsampled, channels):
     """Whole blocks and rows of them, which are left out, with what lies there not finite."""
     rng = np.random.default_rng(4)
-    image, kernel = drawn(rng, 2, 50, 300, 8), drawn(rng, 3, 3, 8, 40)
+    image, kernel = drawn(rng, 2, 50, 300, channels), drawn(rng, 3, 3, channels, 40)
     image = image.at[:, 20:, 135:].set(jnp.nan)
-    low = (drawn(rng, 2, 25, 150, 8), folded(drawn(rng, 3, 3, 8, 40))) if upsampled else (None,) * 2
+    low: tuple = (None, None)
+    if upsampled:
+        low = drawn(rng, 2, 25, 150, channels), folded(drawn(rng, 3, 3, channels, 40))
     passes = np.zeros((2, 50, 300, 40), bool)
     passes[:, :19, :133] = passes[1, 0, :, 35] = True
     if by == "inside":
@@ -188,12 +218,13 @@ def test_few_weights_are_left_to_xla(precision):
 @needs_amx
 @pytest.mark.parametrize("together", [1, 2, 4, 8])
 @pytest.mark.parametrize("form", ["3×3", "5×5", "upsampled"])
-def test_a_part_is_the_same_bits(form, together):
+@pytest.mark.parametrize("channels", [24, 48])
+def test_a_part_is_the_same_bits(form, together, channels):
     """Where it begins at rows that fit, a pixel gets what it gets in the whole image."""
     rng = np.random.default_rng(3)
     edge = 5 if form == "5×5" else 3
-    low, image = drawn(rng, 1, 35, 75, 24), drawn(rng, 1, 70, 150, 24)
-    kernel = drawn(rng, edge, edge, 48 if form == "upsampled" else 24, 40)
+    low, image = drawn(rng, 1, 35, 75, channels), drawn(rng, 1, 70, 150, channels)
+    kernel = drawn(rng, edge, edge, channels * (2 if form == "upsampled" else 1), 40)
 
     def convolved(rows, columns):
         part = image[:, slice(*rows), slice(*columns)]
