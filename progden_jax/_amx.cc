@@ -24,6 +24,7 @@
 #include <memory>
 #include <mutex>
 #include <new>
+#include <utility>
 #include <vector>
 
 #include "xla/ffi/api/ffi.h"
@@ -37,7 +38,7 @@ using Half = uint16_t;  // bfloat16
 constexpr int64_t kTile = 16;       // rows of a tile, and float32 in one of its rows
 constexpr int64_t kDepth = 32;      // bfloat16 in one of its rows
 constexpr int64_t kHalves = 512;    // bfloat16 in a tile
-constexpr int64_t kPixels = 32;     // of a block, by as many outputs: four tiles of sums
+constexpr int64_t kPixels = 32;     // of a block, by as many outputs: four tiles of sums. Or twice by half as many
 constexpr int64_t kSums = 4 * kTile * kTile + kTile;  // of a line of a block; all 4 KiB apart would evict each other
 constexpr int64_t kPatch = 1 << 19; // bytes that what is gathered may take, of a second-level cache's 2 MiB
 
@@ -476,11 +477,11 @@ struct Mask {
   }
 };
 
-// 32 pixels by 32 outputs by R rows.
+// 32 pixels by 32 outputs by R rows, or 64 by 16 where no more outputs are left.
 template <class S>
 struct Block {
   Place at;
-  int64_t rows, pixels;
+  int64_t rows, pixels, outputs;
   Mask masks[S::R];
 };
 
@@ -497,7 +498,7 @@ class Finishing {
   void begin(const Job& job, const Block<S>& block, const float* sums) {
     job_ = &job, block_ = block, sums_ = sums;
     half_ = -1, pixel_ = block.pixels;
-    left_ = (job.outputs - block.at.t * kTile > kTile ? 2 : 1) * block.pixels;
+    left_ = block.outputs / kTile * block.pixels;
     plain_ = block.rows == S::R;
     for (int64_t r = 0; r < block.rows; ++r) plain_ = plain_ && !block.masks[r].gate && !block.masks[r].inside;
   }
@@ -530,10 +531,10 @@ class Finishing {
     const __mmask16 wanted = wanted_;
     const bool relu = job.relu;
     const int64_t next = next_, row = row_;
-    const float* sums = sums_ + pixel_ * 2 * kTile + half_ * kTile;
+    const float* sums = sums_ + pixel_ * block_.outputs + half_ * kTile;
     const float* plus = job.plus ? job.plus + at_ : nullptr;
     float* out = job.out + at_;
-    for (int64_t p = 0; p < count; ++p, sums += 2 * kTile, out += next) {
+    for (int64_t p = 0; p < count; ++p, sums += block_.outputs, out += next) {
       __m512 lines[S::Q], rows[S::R];
       for (int q = 0; q < S::Q; ++q) lines[q] = _mm512_load_ps(sums + q * kSums);
       fold<S>(lines);
@@ -602,7 +603,82 @@ inline void multiply() {
   if (M > 1 && N > 1) _tile_dpbf16ps(3, 5, 7);
 }
 
-// Small products first. Between them vector units write the block before.
+// Pixels in tile 7 by a tile of kernels, 4 to 6, to sums m.
+template <int m, int kernel>
+inline void multiply_one() {
+  if (m == 0 && kernel == 4) _tile_dpbf16ps(0, 7, 4);
+  if (m == 1 && kernel == 4) _tile_dpbf16ps(1, 7, 4);
+  if (m == 2 && kernel == 4) _tile_dpbf16ps(2, 7, 4);
+  if (m == 3 && kernel == 4) _tile_dpbf16ps(3, 7, 4);
+  if (m == 0 && kernel == 5) _tile_dpbf16ps(0, 7, 5);
+  if (m == 1 && kernel == 5) _tile_dpbf16ps(1, 7, 5);
+  if (m == 2 && kernel == 5) _tile_dpbf16ps(2, 7, 5);
+  if (m == 3 && kernel == 5) _tile_dpbf16ps(3, 7, 5);
+  if (m == 0 && kernel == 6) _tile_dpbf16ps(0, 7, 6);
+  if (m == 1 && kernel == 6) _tile_dpbf16ps(1, 7, 6);
+  if (m == 2 && kernel == 6) _tile_dpbf16ps(2, 7, 6);
+  if (m == 3 && kernel == 6) _tile_dpbf16ps(3, 7, 6);
+}
+
+// Four tiles of pixels by one of outputs, of three planes: kernels stay, so that 24 products take 15 loads, where
+// two by one take 20. In the same order, for the same bits.
+template <int... m>
+inline void add_wide(std::integer_sequence<int, m...>, bool half, const Half* at, int64_t stride, int64_t plane,
+                     const Half* kernels) {
+  auto load = [&](int64_t p, int64_t tile) {
+    _tile_loadd(7, at + p * plane + tile * kTile * stride, stride * sizeof(Half));
+  };
+  _tile_loadd(4, kernels, 64);
+  _tile_loadd(5, kernels + kHalves, 64);
+  _tile_loadd(6, kernels + 2 * kHalves, 64);
+  if (half) {
+    ((load(1, m), multiply_one<m, 4>()), ...);
+    ((load(0, m), multiply_one<m, 5>(), multiply_one<m, 6>()), ...);
+  } else {
+    ((load(2, m), multiply_one<m, 4>()), ...);
+    ((load(1, m), multiply_one<m, 4>(), multiply_one<m, 5>()), ...);
+    ((load(0, m), multiply_one<m, 5>(), multiply_one<m, 6>(), multiply_one<m, 4>()), ...);
+  }
+}
+
+// Small products first.
+template <int P, int M, int N>
+inline void add_step(const Half* at, int64_t stride, int64_t plane, const Half* kernels, int64_t next) {
+  if (P == 3) {
+    load_pixels<M>(at + 2 * plane, stride);
+    load_kernels<N>(kernels, next);
+    multiply<M, N>();
+  }
+  if (P >= 2) {
+    load_pixels<M>(at + plane, stride);
+    if (P == 2) load_kernels<N>(kernels, next);
+    multiply<M, N>();
+    load_kernels<N>(kernels + kHalves, next);
+    if (P == 3) multiply<M, N>();
+  }
+  load_pixels<M>(at, stride);
+  if (P >= 2) multiply<M, N>();
+  if (P == 3) {
+    load_kernels<N>(kernels + 2 * kHalves, next);
+    multiply<M, N>();
+  }
+  load_kernels<N>(kernels, next);
+  multiply<M, N>();
+}
+
+template <int M, int N>
+inline void add_half(const Half* at, int64_t stride, int64_t plane, const Half* kernels, int64_t next) {
+  load_pixels<M>(at + plane, stride);
+  load_kernels<N>(kernels, next);
+  multiply<M, N>();
+  load_pixels<M>(at, stride);
+  load_kernels<N>(kernels + kHalves, next);
+  multiply<M, N>();
+  load_kernels<N>(kernels + 2 * kHalves, next);
+  multiply<M, N>();
+}
+
+// Between products vector units write the block before.
 template <int P, int M, int N, class S>
 inline void add_lines(const Part& part, const Half* pixels, int64_t stride, const Patch& patch, const Half* kernels,
                       int64_t next, int64_t lines, Finishing<S>& before, int64_t each) {
@@ -613,44 +689,18 @@ inline void add_lines(const Part& part, const Half* pixels, int64_t stride, cons
     if (++done % 4 == 0) _tile_stored(6, unused, 64);
     for (int64_t n = 0; n < each; ++n) before.advance();
   };
+  auto add = [&](bool half, const Half* at) {
+    if constexpr (M == 4) add_wide(std::make_integer_sequence<int, M>(), half, at, stride, patch.plane, kernels);
+    else if (half) add_half<M, N>(at, stride, patch.plane, kernels, next);
+    else add_step<P, M, N>(at, stride, patch.plane, kernels, next);
+    kernels += P * kHalves;
+    between();
+  };
   for (int64_t line = 0; line < lines; ++line, pixels += patch.row)
     for (int64_t tap = 0; tap < part.across; ++tap) {
       const Half* at = pixels + tap * patch.pixel;
-      for (int64_t k = 0; k < part.steps; ++k, at += patch.step, kernels += P * kHalves) {
-        if (P == 3) {
-          load_pixels<M>(at + 2 * patch.plane, stride);
-          load_kernels<N>(kernels, next);
-          multiply<M, N>();
-        }
-        if (P >= 2) {
-          load_pixels<M>(at + patch.plane, stride);
-          if (P == 2) load_kernels<N>(kernels, next);
-          multiply<M, N>();
-          load_kernels<N>(kernels + kHalves, next);
-          if (P == 3) multiply<M, N>();
-        }
-        load_pixels<M>(at, stride);
-        if (P >= 2) multiply<M, N>();
-        if (P == 3) {
-          load_kernels<N>(kernels + 2 * kHalves, next);
-          multiply<M, N>();
-        }
-        load_kernels<N>(kernels, next);
-        multiply<M, N>();
-        between();
-      }
-      if (P == 3 && part.half) {
-        load_pixels<M>(at + kDepth, stride);
-        load_kernels<N>(kernels, next);
-        multiply<M, N>();
-        load_pixels<M>(at, stride);
-        load_kernels<N>(kernels + kHalves, next);
-        multiply<M, N>();
-        load_kernels<N>(kernels + 2 * kHalves, next);
-        multiply<M, N>();
-        kernels += P * kHalves;
-        between();
-      }
+      for (int64_t k = 0; k < part.steps; ++k, at += patch.step) add(false, at);
+      if (P == 3 && part.half) add(true, at);
     }
 }
 
@@ -658,15 +708,15 @@ inline void add_lines(const Part& part, const Half* pixels, int64_t stride, cons
 template <int P, int M, int N, class S>
 void add_block(const Job& job, const Patch* patches, int64_t line, const Place& at, float* sums,
                Finishing<S>& before) {
-  constexpr int64_t kRow = 2 * kTile;
+  constexpr int64_t kRow = N * kTile;
   int64_t steps = 0;
   for (const Part& part : job.parts) steps += part.lines<S>() * part.begun();
   const int64_t each = (before.left() + steps - 1) / steps;
   for (int q = 0; q < S::Q; ++q, sums += kSums) {
     _tile_zero(0);
-    if (N > 1) _tile_zero(1);
-    if (M > 1) _tile_zero(2);
-    if (M > 1 && N > 1) _tile_zero(3);
+    _tile_zero(1);
+    _tile_zero(2);
+    _tile_zero(3);
     for (size_t n = 0; n < job.parts.size(); ++n) {
       const Part& part = job.parts[n];
       const Source& s = part.of;
@@ -681,17 +731,21 @@ void add_block(const Job& job, const Patch* patches, int64_t line, const Place& 
     }
     _tile_stored(0, sums, kRow * sizeof(float));
     if (N > 1) _tile_stored(1, sums + kTile, kRow * sizeof(float));
-    if (M > 1) _tile_stored(2, sums + kTile * kRow, kRow * sizeof(float));
+    if (M == 4) _tile_stored(1, sums + kTile * kRow, kRow * sizeof(float));
+    if (M > 1) _tile_stored(2, sums + M / 2 * kTile * kRow, kRow * sizeof(float));
     if (M > 1 && N > 1) _tile_stored(3, sums + kTile * kRow + kTile, kRow * sizeof(float));
+    if (M == 4) _tile_stored(3, sums + 3 * kTile * kRow, kRow * sizeof(float));
   }
 }
 
 template <int P, class S>
 void add_any(const Job& job, const Patch* patches, int64_t line, const Block<S>& block, float* sums,
              Finishing<S>& before) {
-  const bool one = block.pixels <= kTile, last = job.tiles() - block.at.t == 1;
-  (one ? last ? add_block<P, 1, 1, S> : add_block<P, 1, 2, S>
-       : last ? add_block<P, 2, 1, S> : add_block<P, 2, 2, S>)(job, patches, line, block.at, sums, before);
+  const bool one = block.pixels <= kTile, last = block.outputs == kTile;
+  auto add = one ? last ? add_block<P, 1, 1, S> : add_block<P, 1, 2, S>
+                 : last ? add_block<P, 2, 1, S> : add_block<P, 2, 2, S>;
+  if (P == 3 && block.pixels > kPixels) add = add_block<3, 4, 1, S>;
+  add(job, patches, line, block.at, sums, before);
 }
 
 void zero(const Job& job, const Place& at, int64_t rows, int64_t pixels) {
@@ -741,8 +795,12 @@ void task(const Job& job, int64_t index) {
       for (at.j = 0; at.j < job.step; ++at.j)
         for (at.t = 0; at.t < job.tiles(); at.t += 2)
           for (at.y = y; at.y < end; at.y += S::R)
-            for (at.x = x0; at.x < x1; at.x += kPixels) {
-              Block<S> block{at, std::min<int64_t>(S::R, end - at.y), std::min(kPixels, x1 - at.x), {}};
+            for (int64_t pixels, left = x1 - x0; left > 0; left -= pixels) {
+              at.x = x1 - left;
+              const bool last = job.tiles() - at.t == 1;
+              // Few outputs alone are written slower so.
+              pixels = std::min(last && at.t && P == 3 ? 2 * kPixels : kPixels, left);
+              Block<S> block{at, std::min<int64_t>(S::R, end - at.y), pixels, (last ? 1 : 2) * kTile, {}};
               bool any = false;
               for (int64_t r = 0; r < block.rows; ++r) {
                 block.masks[r] = Mask(job, at, r);
