@@ -238,10 +238,11 @@ struct Part {
     half = woven && of.c % kDepth;
     across = woven ? of.kw : 1;
     steps = woven ? of.c / kDepth : (of.kw * of.c + kDepth - 1) / kDepth;
-    size = across * (steps + half) * P * kHalves;
+    size = all_steps() * P * kHalves;
   }
 
-  int64_t begun() const { return across * (steps + half); }
+  // Of a line, full and half ones.
+  int64_t all_steps() const { return across * (steps + half); }
 
   template <class S>
   int64_t lines() const { return S::kSummed ? taps.size() : S::Q; }
@@ -259,9 +260,12 @@ struct Job {
   int64_t n, H, W, outputs;
   int64_t step = 1;                 // 2 where a source has corners: even and odd pixels have taps of their own
   int64_t rows = 0, columns = 0;    // of a task, in cells of step by step pixels
-  int64_t height = 0;               // rows of those that are gathered at a time
 
   int64_t tiles() const { return (outputs + kTile - 1) / kTile; }
+
+  // Rows that are gathered at a time.
+  template <class S>
+  int64_t height() const { return S::kSummed ? rows : S::R; }
 };
 
 struct Patch {
@@ -710,7 +714,7 @@ void add_block(const Job& job, const Patch* patches, int64_t line, const Place& 
                Finishing<S>& before) {
   constexpr int64_t kRow = N * kTile;
   int64_t steps = 0;
-  for (const Part& part : job.parts) steps += part.lines<S>() * part.begun();
+  for (const Part& part : job.parts) steps += part.lines<S>() * part.all_steps();
   const int64_t each = (before.left() + steps - 1) / steps;
   for (int q = 0; q < S::Q; ++q, sums += kSums) {
     _tile_zero(0);
@@ -738,16 +742,6 @@ void add_block(const Job& job, const Patch* patches, int64_t line, const Place& 
   }
 }
 
-template <int P, class S>
-void add_any(const Job& job, const Patch* patches, int64_t line, const Block<S>& block, float* sums,
-             Finishing<S>& before) {
-  const bool one = block.pixels <= kTile, last = block.outputs == kTile;
-  auto add = one ? last ? add_block<P, 1, 1, S> : add_block<P, 1, 2, S>
-                 : last ? add_block<P, 2, 1, S> : add_block<P, 2, 2, S>;
-  if (P == 3 && block.pixels > kPixels) add = add_block<3, 4, 1, S>;
-  add(job, patches, line, block.at, sums, before);
-}
-
 void zero(const Job& job, const Place& at, int64_t rows, int64_t pixels) {
   const int64_t x = at.x * job.step + at.j, output = at.t * kTile;
   const int64_t bytes = std::min(2 * kTile, job.outputs - output) * sizeof(float);
@@ -773,54 +767,83 @@ void gather_all(const Job& job, const Place& at, int64_t y0, int64_t y1, int64_t
   }
 }
 
+// Blocks of a task, one after the other.
+template <int P, class S>
+class Blocks {
+ public:
+  Blocks(const Job& job, int64_t x0, int64_t x1, Memory* memory) : job_(job), x0_(x0), x1_(x1), memory_(memory) {}
+
+  // Of rows that are gathered together, of one parity.
+  void rows(Place at, int64_t y0, int64_t y1) {
+    bool gathered = false;
+    for (at.j = 0; at.j < job_.step; ++at.j)
+      for (at.t = 0; at.t < job_.tiles(); at.t += 2)
+        for (at.y = y0; at.y < y1; at.y += S::R) {
+          const bool last = job_.tiles() - at.t == 1;
+          // Few outputs alone are written slower by twice as many pixels.
+          const int64_t most = last && at.t && P == 3 ? 2 * kPixels : kPixels;
+          for (at.x = x0_; at.x < x1_; at.x += most) {
+            const int64_t pixels = std::min(most, x1_ - at.x), outputs = (last ? 1 : 2) * kTile;
+            Block<S> block{at, std::min<int64_t>(S::R, y1 - at.y), pixels, outputs, {}};
+            // Padding around an image is all zeros, and costs no more than writing them.
+            if (!passes(block)) {
+              zero(job_, at, block.rows, block.pixels);
+              continue;
+            }
+            if (!gathered) gather_all<P, S>(job_, at, y0, y1, x0_, x1_, memory_, patches_);
+            gathered = true;
+            add(block, (at.y - y0) / S::R * S::Q);
+          }
+        }
+  }
+
+  void finish() { before_.all(); }
+
+ private:
+  bool passes(Block<S>& block) const {
+    bool any = false;
+    for (int64_t r = 0; r < block.rows; ++r) {
+      block.masks[r] = Mask(job_, block.at, r);
+      any = block.masks[r].any(job_, block.at, block.pixels) || any;
+    }
+    return any;
+  }
+
+  void add(const Block<S>& block, int64_t line) {
+    const bool one = block.pixels <= kTile, last = block.outputs == kTile;
+    auto add = one ? last ? add_block<P, 1, 1, S> : add_block<P, 1, 2, S>
+                   : last ? add_block<P, 2, 1, S> : add_block<P, 2, 2, S>;
+    if (P == 3 && block.pixels > kPixels) add = add_block<3, 4, 1, S>;
+    add(job_, patches_, line, block.at, sums_[turn_], before_);
+    before_.all();
+    before_.begin(job_, block, sums_[turn_]);
+    turn_ ^= 1;
+  }
+
+  const Job& job_;
+  const int64_t x0_, x1_;
+  Memory* memory_;
+  Patch patches_[3];
+  alignas(64) float sums_[2][S::Q * kSums];
+  Finishing<S> before_;
+  int turn_ = 0;
+};
+
 template <int P, class S>
 void task(const Job& job, int64_t index) {
   thread_local Memory memory[3];
-  const int64_t h = job.H / job.step, w = job.W / job.step;
+  const int64_t h = job.H / job.step, w = job.W / job.step, height = job.height<S>();
   const int64_t across = (w + job.columns - 1) / job.columns, down = (h + job.rows - 1) / job.rows;
-  Place at;
+  Place at{};
   at.image = index / (across * down);
   const int64_t y0 = index / across % down * job.rows, x0 = index % across * job.columns;
   const int64_t y1 = std::min(h, y0 + job.rows), x1 = std::min(w, x0 + job.columns);
   const Palette palette;
   _tile_loadconfig(&palette);
-  Patch patches[3];
-  alignas(64) float sums[2][S::Q * kSums];
-  Finishing<S> before;
-  int64_t turn = 0;
-  for (at.i = 0; at.i < job.step; ++at.i) {
-    for (int64_t y = y0; y < y1; y += job.height) {
-      const int64_t end = std::min(y1, y + job.height);
-      bool gathered = false;
-      for (at.j = 0; at.j < job.step; ++at.j)
-        for (at.t = 0; at.t < job.tiles(); at.t += 2)
-          for (at.y = y; at.y < end; at.y += S::R)
-            for (int64_t pixels, left = x1 - x0; left > 0; left -= pixels) {
-              at.x = x1 - left;
-              const bool last = job.tiles() - at.t == 1;
-              // Few outputs alone are written slower so.
-              pixels = std::min(last && at.t && P == 3 ? 2 * kPixels : kPixels, left);
-              Block<S> block{at, std::min<int64_t>(S::R, end - at.y), pixels, (last ? 1 : 2) * kTile, {}};
-              bool any = false;
-              for (int64_t r = 0; r < block.rows; ++r) {
-                block.masks[r] = Mask(job, at, r);
-                any = block.masks[r].any(job, at, block.pixels) || any;
-              }
-              // Padding around an image is all zeros, and costs no more than writing them.
-              if (!any) {
-                zero(job, at, block.rows, block.pixels);
-                continue;
-              }
-              if (!gathered) gather_all<P, S>(job, at, y, end, x0, x1, memory, patches);
-              gathered = true;
-              add_any<P, S>(job, patches, (at.y - y) / S::R * S::Q, block, sums[turn], before);
-              before.all();
-              before.begin(job, block, sums[turn]);
-              turn ^= 1;
-            }
-    }
-  }
-  before.all();
+  Blocks<P, S> blocks(job, x0, x1, memory);
+  for (at.i = 0; at.i < job.step; ++at.i)
+    for (int64_t y = y0; y < y1; y += height) blocks.rows(at, y, std::min(y1, y + height));
+  blocks.finish();
   _mm_sfence();
   _tile_release();
 }
@@ -859,18 +882,17 @@ void run(Job& job, ffi::ThreadPool& pool) {
   for (Part& part : job.parts) pack<P, S>(job, part);
   job.rows = kTile / job.step;
   job.columns = 4 * kPixels;
-  job.height = S::kSummed ? job.rows : S::R;
   auto bytes = [&] {
     int64_t total = 0;
     for (const Part& part : job.parts) {
       const Source& s = part.of;
-      const int64_t lines = S::kSummed ? job.height + part.taps.size() - 1 : S::Q;
+      const int64_t lines = S::kSummed ? job.rows + part.taps.size() - 1 : S::Q;
       total += lines * (job.columns * (s.corners ? 1 : job.step) + s.kw) * s.c * P * sizeof(Half);
     }
     return total;
   };
   while (job.columns > kPixels && bytes() > kPatch) job.columns /= 2;
-  while (job.height > S::R && bytes() > kPatch) job.rows = job.height /= 2;
+  while (S::kSummed && job.rows > 1 && bytes() > kPatch) job.rows /= 2;
   const int64_t h = job.H / job.step, w = job.W / job.step;
   const int64_t count = job.n * ((h + job.rows - 1) / job.rows) * ((w + job.columns - 1) / job.columns);
   in_parallel(pool, count, [&job](int64_t index) { task<P, S>(job, index); });

@@ -34,7 +34,7 @@ _FLAGS = (
 )
 _NEEDED = {"avx512bw", "avx512dq", "avx512vl", "avx512_bf16", "amx_tile", "amx_bf16"}
 _PATIENCE = 120.0
-"""Seconds that the compiler may take; it takes eight."""
+"""Seconds that the compiler may take; it takes ten."""
 
 _PLANES = {"bfloat16": 1, "high": 2, "tensorfloat32": 2}
 """Precision -> how many bfloat16 stand for a value: relative errors of 2e-3, 4e-6, and 2e-7 with three."""
@@ -57,7 +57,7 @@ def planes(precision: Any, kernel: Any, *others: Any) -> int:
 
 
 def available() -> bool:
-    """Whether this process convolves by AMX; the first call may compile for eight seconds."""
+    """Whether this process convolves by AMX; the first call may compile for ten seconds."""
     return jax.default_backend() == "cpu" and status() is None
 
 
