@@ -14,9 +14,11 @@ import progden_jax as pd
 from experiments import _common
 from experiments.performance import native
 from progden_jax import mixers
+from progden_jax._canvas import canvas_size
 from progden_jax.denoisers import graph
 from progden_jax.mixers import multiscale
 from progden_jax.mixing import level_of
+from progden_jax.survey import crop
 
 OURS, NATIVE, TORCH = "progden_jax", "native OIDN", "PyTorch"
 FORWARD, DIVERGENCE, BOUND = "forward pass", "divergence", "t-bound"
@@ -125,23 +127,35 @@ def mixing_net(params: Any, seen: Any) -> Any:
 
 def _shipped_features(mixer: mixers.NetworkMixer, *images: Any) -> Any:
     """As the pipeline runs them, and of them a few sums: 54 channels of all of it are never there."""
-    level = level_of(images[0])
+    inside = images[-1]
+    level = level_of(images[0], inside)
     kernel = jnp.ones((multiscale.CHANNELS, 4))
 
     def applied(*some: Any) -> Any:
-        return multiscale.features(*some, level=level)[0] @ kernel
+        *known, there = some
+        return multiscale.features(*known, inside=there, level=level)[0] @ kernel
 
     return mixers.banded(applied, images, mixer.receptive_radius)
 
 
 def _shipped_parts(scene: Scene) -> Iterator[tuple[str, float | None, Callable[..., Any], tuple]]:
+    """On the canvas, where the pipeline has them."""
     mixer = scene.shipped
-    images = (scene.x, scene.y, scene.variance, scene.divergence)
+    height, width = size = scene.x.shape[:2]
+    canvas = canvas_size(height), canvas_size(width)
+    known = (scene.x, scene.y, scene.variance, scene.divergence, scene.risk)
+    *images, risk, inside = (
+        jnp.asarray(crop(image, (0, 0), canvas)) for image in (*known, np.ones((*size, 1), bool))
+    )
     if isinstance(mixer, mixers.NetworkMixer):
-        yield FEATURES + SHIPPED, None, _shipped_features, (mixer, *images)
-        arguments = (mixer, *images, scene.risk)
+        yield FEATURES + SHIPPED, None, _shipped_features, (mixer, *images, inside)
+
+        def alpha(mixer: mixers.NetworkMixer, *images: Any) -> Any:
+            *known, there = images
+            return mixer(*known, inside=there)
+
         operations = scene.operations_of(mixer)
-        yield f"features and net{SHIPPED}", operations, lambda m, *a: m(*a), arguments
+        yield f"features and net{SHIPPED}", operations, alpha, (mixer, *images, risk, inside)
 
 
 def wholes(scene: Scene, probes: int, against: Sequence[str]) -> Iterator[Program]:

@@ -144,21 +144,24 @@ def features(
     Parameters
     ----------
     x, y, variance, divergence : (H, W, 3), see `progden_jax.sure`.
-    inside : (H, W, 1) False where they are padding around the image.
+    inside : (H, W, 1) False where they are padding around the image, which is a rectangle.
     level : mean radiance of the whole image, where these are a tile of it; by default that of `x`.
     without : `GROUPS` of features to give as zeros.
     """
-    counted = jnp.ones_like(x) if inside is None else jnp.broadcast_to(inside, x.shape)
+    there = jnp.ones((*x.shape[:-1], 1), bool) if inside is None else inside
 
-    # Of every channel, though all are the same: XLA turns a division by what is broadcast into a product, and
-    # products and the sums before them it repeats in every use, channel by channel.
     @functools.cache  # tracing takes time, too
-    def pixels(window: int) -> Array:
-        return jnp.maximum(_windows.box_sum(counted.astype(x.dtype), window), 1)
+    def pixels(window: int, channels: int) -> Array:
+        rows, columns = (there.any(axis, keepdims=True).astype(x.dtype) for axis in (1, 0))
+        counts = (jnp.maximum(_windows.box_sum(n, window), 1) for n in (rows, columns))
+        # As a product, not of one image for all channels: XLA turns a division by what is broadcast into a
+        # product, and products and the sums before them it repeats in every use.
+        rows, columns = (jnp.broadcast_to(n, (*x.shape[:-1], channels)) for n in counts)
+        return rows * columns
 
     def mean(value: Array, window: int) -> Array:
         value = value if inside is None else jnp.where(inside, value, 0)
-        return _windows.box_sum(value, window) / pixels(window)[..., : value.shape[-1]]
+        return _windows.box_sum(value, window) / pixels(window, value.shape[-1])
 
     # In units of the image's mean no square here leaves float32's range, nor its derivatives.
     if level is None:
