@@ -259,7 +259,7 @@ def _up(n: int, step: int) -> int:
 def window_edges(smallest: int) -> tuple[int, ...]:
     """Edges to choose from, so that programs are shared between budgets."""
     edges = {smallest}
-    n = 256
+    n = 64
     while n <= 8192:
         edges |= {k * n // 4 for k in (4, 5, 6, 7)}
         n *= 2

@@ -249,6 +249,17 @@ def test_a_window_is_as_large_as_the_memory_allows():
         memory.window_edge(10**9, 288, compiled, guess=lambda _: 1000)
 
 
+def test_a_window_of_a_small_network_is_not_mostly_margin():
+    compiled, tried = program_of(1000)
+    edge = memory.window_edge(25 * 10**6, 78, compiled, guess=lambda _: 1000)
+    assert tried == [edge] == [128]
+    for smallest in (8, 64, 78, 100, 300):
+        edges = np.array(tiling.window_edges(smallest))
+        assert edges[0] == smallest
+        after = edges[edges >= 64]
+        assert (after[1:] <= 1.26 * after[:-1]).all()
+
+
 def test_a_survey_repairs_as_the_whole_frame_would(real_frame):
     rng = np.random.default_rng(0)
     frame = mirrored(real_frame, 530, 20)
