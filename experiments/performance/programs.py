@@ -141,21 +141,22 @@ def _shipped_features(mixer: mixers.NetworkMixer, *images: Any) -> Any:
 def _shipped_parts(scene: Scene) -> Iterator[tuple[str, float | None, Callable[..., Any], tuple]]:
     """On the canvas, where the pipeline has them."""
     mixer = scene.shipped
+    if not isinstance(mixer, mixers.NetworkMixer):
+        return
     height, width = size = scene.x.shape[:2]
     canvas = canvas_size(height), canvas_size(width)
     known = (scene.x, scene.y, scene.variance, scene.divergence, scene.risk)
     *images, risk, inside = (
         jnp.asarray(crop(image, (0, 0), canvas)) for image in (*known, np.ones((*size, 1), bool))
     )
-    if isinstance(mixer, mixers.NetworkMixer):
-        yield FEATURES + SHIPPED, None, _shipped_features, (mixer, *images, inside)
+    yield FEATURES + SHIPPED, None, _shipped_features, (mixer, *images, inside)
 
-        def alpha(mixer: mixers.NetworkMixer, *images: Any) -> Any:
-            *known, there = images
-            return mixer(*known, inside=there)
+    def alpha(mixer: mixers.NetworkMixer, *images: Any) -> Any:
+        *known, there = images
+        return mixer(*known, inside=there)
 
-        operations = scene.operations_of(mixer)
-        yield f"features and net{SHIPPED}", operations, alpha, (mixer, *images, risk, inside)
+    operations = scene.operations_of(mixer)
+    yield f"features and net{SHIPPED}", operations, alpha, (mixer, *images, risk, inside)
 
 
 def wholes(scene: Scene, probes: int, against: Sequence[str]) -> Iterator[Program]:
