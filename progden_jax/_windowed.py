@@ -69,6 +69,7 @@ def within(
         edge = memory.window_edge(
             max_memory - kept,
             tiling.smallest_window(reach, step),
+            step,
             lambda edge: _compiled(job, frame, divergence, edge),
             lambda pixels: _guess(job, (math.isqrt(pixels), math.isqrt(pixels))),
         )
@@ -101,7 +102,7 @@ def assemble(
         images["image"] = color if "color" in whole.patches else color.copy()
     # Known before the image, which may be the same memory, is written to.
     exposure = jax.block_until_ready(exposure_of(color, job.denoiser)) if windows else None
-    sums = dict.fromkeys(_MEANS, 0.0)
+    sums = dict.fromkeys(MEANS, 0.0)
     denoised, computed = 0, 0
     if skip is not None:
         windows = [window for window in windows if _is_noisy(whole, window, skip)]
@@ -128,7 +129,7 @@ def assemble(
     )
 
 
-_MEANS = ("mean_alpha", "mean_sure")
+MEANS = ("mean_alpha", "mean_sure")
 
 
 def _is_noisy(whole: Survey, window: Window, skip: Skip) -> bool:

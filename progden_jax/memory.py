@@ -198,6 +198,7 @@ def huge_pages() -> bool:
 def window_edge(
     available: float,
     smallest: int,
+    step: int,
     needs: Callable[[int], Any],
     guess: Callable[[int], float],
 ) -> int:
@@ -207,6 +208,7 @@ def window_edge(
     ----------
     available : bytes for one window's program: its arguments, results and temporaries.
     smallest : the least edge that is of use.
+    step : multiples that edges are of.
     needs : the compiled program for a window of that edge, as `jax.stages.Compiled`.
     guess : of a window's pixels, bytes for each, to start from; too many cost speed, too few a compilation.
 
@@ -215,7 +217,7 @@ def window_edge(
     ValueError
         If not even the smallest window fits.
     """
-    edges = tiling.window_edges(smallest)
+    edges = tiling.window_edges(smallest, step)
 
     def largest(bytes_of_each: Callable[[int], float]) -> int:
         fitting = [n for n in edges if n * n * bytes_of_each(n * n) * SLACK <= available]

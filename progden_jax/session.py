@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from progden_jax import _checks, skipping, tiling
 from progden_jax._canvas import canvas_size
 from progden_jax._program import Job, Valid, core_mask, prepare
-from progden_jax._windowed import Place, what_was_skipped
+from progden_jax._windowed import MEANS, Place, what_was_skipped
 from progden_jax.denoisers import Denoiser
 from progden_jax.divergence import Method
 from progden_jax.frame import Frame, Repairs
@@ -175,11 +175,12 @@ class Session:
 
     def _ready(self, windows: list[Window]) -> bool:
         """Whether the programs for these windows are there; if not, they are asked for."""
-        forms = jax.eval_shape(_surveyed, self._job.denoiser, self._forms(), self._valid)
-        self._compile("survey", _surveyed, self._job.denoiser, self._forms(), self._valid)
-        images = dict.fromkeys(self._job.outputs, forms.frame.color)
+        arguments = (self._job, self._forms(), self._valid)
+        forms, so_far = jax.eval_shape(_surveyed, *arguments)
+        self._compile("survey", _surveyed, *arguments)
         for window in windows:
-            arguments = (self._job, forms.frame, images, self._valid, _place(window, forms))
+            part = (_place(window, forms), self._shares(window, windows))
+            arguments = (self._job, forms.frame, so_far, self._valid, *part)
             self._compile(window.shape, _window, *arguments, shape=window.shape)
         wanted = ["survey", *(window.shape for window in windows)]
         return all(self._programs[kind].done() for kind in wanted)
@@ -190,33 +191,23 @@ class Session:
 
     def _pieces(self, buffers: Images, windows: list[Window], rule: Skip) -> Result:
         """x, and in the windows' cores the mix."""
-        survey = self._programs["survey"].result()(self._job.denoiser, buffers, self._valid)
-        color = survey.frame.color
-        images = {
-            name: jnp.copy(color) if name == "image" else jnp.zeros_like(color)
-            for name in self._job.outputs
-        }
-        pixels, denoised = self.size[0] * self.size[1], 0
-        alpha = risk = jnp.zeros((), color.dtype)
+        survey, so_far = self._programs["survey"].result()(self._job, buffers, self._valid)
         for window in windows:
             program = self._programs[window.shape].result()
-            images, means = program(
-                self._job, survey.frame, images, self._valid, _place(window, survey)
-            )
-            denoised += window.core_pixels
-            alpha, risk = (
-                total + window.core_pixels * mean
-                for total, mean in zip((alpha, risk), means, strict=True)
-            )
-        result = self._job.result(
-            images,
-            repairs=survey.repairs,
-            mean_alpha=alpha / pixels,
-            mean_sure=risk / max(denoised, 1),
-        )
+            part = (_place(window, survey), self._shares(window, windows))
+            so_far = program(self._job, survey.frame, so_far, self._valid, *part)
+        images, means = so_far
+        result = self._job.result(images, repairs=survey.repairs, **means)
         computed = sum(window.area for window in windows)
-        skipped = what_was_skipped(pixels, denoised, computed, rule)
+        denoised = sum(window.core_pixels for window in windows)
+        skipped = what_was_skipped(self.size[0] * self.size[1], denoised, computed, rule)
         return _cropped(result, self.size)._replace(skipped=skipped)
+
+    def _shares(self, window: Window, windows: list[Window]) -> dict[str, Any]:
+        """What its core counts for in the whole frame's means."""
+        denoised = sum(w.core_pixels for w in windows)
+        pixels = {"mean_alpha": self.size[0] * self.size[1], "mean_sure": denoised}
+        return {name: self._dtype.type(window.core_pixels / n) for name, n in pixels.items()}
 
 
 class _Survey(NamedTuple):
@@ -229,19 +220,27 @@ class _Survey(NamedTuple):
     exposure: Any
 
 
+_SoFar = tuple[Images, dict[str, Array]]
+"""The images that were asked for, and means, of the windows up to now."""
+
+
 @jax.jit
-def _surveyed(denoiser: Any, buffers: Images, valid: Valid | None) -> _Survey:
+def _surveyed(job: Job, buffers: Images, valid: Valid | None) -> tuple[_Survey, _SoFar]:
+    """Also x and α = 0 everywhere, where windows are filled in."""
     frame, _, repairs = prepare(frame_of(buffers), valid, None)
     height, width = frame.size if valid is None else valid
     values = 3.0 * height * width
-    find = getattr(denoiser, "exposure_of", None)
-    return _Survey(
+    find = getattr(job.denoiser, "exposure_of", None)
+    color = frame.color
+    found = _Survey(
         frame,
         repairs,
         cast(Array, frame.variance).sum() / values,
-        jnp.maximum(frame.color, 0).sum() / values,
+        jnp.maximum(color, 0).sum() / values,
         None if find is None else find(frame, valid),
     )
+    images = {n: color if n == "image" else jnp.zeros_like(color) for n in job.outputs}
+    return found, (images, dict.fromkeys(MEANS, jnp.zeros((), color.dtype)))
 
 
 @functools.partial(jax.jit, donate_argnames="given")
@@ -249,11 +248,18 @@ def _whole(job: Job, given: Images, kept: Images, valid: Valid | None) -> Result
     return job.program(job, frame_of(given | kept), None, valid)
 
 
-@functools.partial(jax.jit, static_argnames="shape", donate_argnames="images")
+@functools.partial(jax.jit, static_argnames="shape", donate_argnames="so_far")
 def _window(
-    job: Job, frame: Frame, images: Images, valid: Valid, place: Place, shape: tuple[int, int]
-) -> tuple[Images, tuple[Array, Array]]:
-    """The images with this window's core filled in, and its means of α and SURE."""
+    job: Job,
+    frame: Frame,
+    so_far: _SoFar,
+    valid: Valid,
+    place: Place,
+    shares: dict[str, Array],
+    shape: tuple[int, int],
+) -> _SoFar:
+    """The images with this window's core filled in, and the means with what is there."""
+    images, means = so_far
 
     def cut(image: Array) -> Array:
         return lax.dynamic_slice(image, (*place.origin, 0), (*shape, image.shape[-1]))
@@ -270,7 +276,7 @@ def _window(
         )
         for name, image in images.items()
     }
-    return filled, (found.mean_alpha, found.mean_sure)
+    return filled, {n: mean + shares[n] * getattr(found, n) for n, mean in means.items()}
 
 
 @functools.partial(jax.jit, static_argnames="canvas")

@@ -9,6 +9,7 @@ from typing import Any, Protocol, cast
 import numpy as np
 
 from progden_jax.denoisers import Denoiser
+from progden_jax.denoisers._base import aligned_radius
 from progden_jax.frame import Frame
 from progden_jax.mixing import Mixer
 from progden_jax.tstatistic import Bound
@@ -29,7 +30,10 @@ class Tileable(Protocol):
     """How many pixels away an output pixel can depend on the input."""
 
     alignment: int
-    """Pixels after which the way that outputs depend on inputs repeats; tiles begin at multiples."""
+    """Pixels after which the way that outputs depend on inputs repeats; tiles begin and end at multiples.
+
+    Where an output pixel of such a tile depends on less, ``aligned_radius`` may say so, in pixels.
+    """
 
     def exposure_of(self, frame: Frame, valid: Any) -> Any:
         """What depends on the whole image, taken as ``bind(tile, valid=..., exposure=...)``."""
@@ -106,14 +110,14 @@ def margin(
         )
     tileable = cast(Tileable, denoiser)
     if mixer is None:
-        return tileable.receptive_radius
+        return aligned_radius(tileable)
     if not can_tile(denoiser, mixer):
         raise ValueError(
             f"the mixer {mixer!r} cannot work on tiles: give it a receptive_radius in pixels, "
             "or leave max_memory out."
         )
     bounded = 0 if bound is None else bound.radius
-    return tileable.receptive_radius + cast(Any, mixer).receptive_radius + bounded
+    return aligned_radius(tileable) + cast(Any, mixer).receptive_radius + bounded
 
 
 @dataclasses.dataclass(frozen=True)
@@ -256,11 +260,11 @@ def _up(n: int, step: int) -> int:
 
 
 @functools.cache
-def window_edges(smallest: int) -> tuple[int, ...]:
-    """Edges to choose from, so that programs are shared between budgets."""
+def window_edges(smallest: int, step: int) -> tuple[int, ...]:
+    """Edges to choose from, multiples of `step`, so that programs are shared between budgets."""
     edges = {smallest}
     n = 64
     while n <= 8192:
-        edges |= {k * n // 4 for k in (4, 5, 6, 7)}
+        edges |= {_up(k * n // 4, step) for k in (4, 5, 6, 7)}
         n *= 2
     return tuple(sorted(n for n in edges if n >= smallest))

@@ -224,14 +224,17 @@ def test_pooling_sends_ties_to_the_first():
 @pytest.mark.parametrize("size", ["small", "large"])
 def test_receptive_radius_is_never_exceeded(size):
     denoiser = narrow_oidn(width=1, size=size)
-    radius = pd.denoisers.load({"small": "oidn-hdr", "large": "oidn-hdr-calb-cnrm-large"}[size])
-    radius = radius.receptive_radius
-    assert denoiser.receptive_radius == radius
+    theirs = pd.denoisers.load({"small": "oidn-hdr", "large": "oidn-hdr-calb-cnrm-large"}[size])
+    radius, aligned = theirs.receptive_radius, theirs.aligned_radius
+    assert (denoiser.receptive_radius, denoiser.aligned_radius) == (radius, aligned)
     params = jax.tree.map(np.ones_like, denoiser.params)
     image = np.ones((2 * 16 * (radius // 16 + 1) + 16, 16, 3), np.float32)
-    reached = 0
+    reached, needed = 0, []
     f = jax.jit(jax.grad(lambda x, p: graph.evaluate(denoiser.nodes, params, x)[0][p, 0, 0]))
     for p in range(len(image) // 2 - 8, len(image) // 2 + 8):
         rows = np.flatnonzero(np.asarray(f(image, p)).any((1, 2)))
         reached = max(reached, p - rows.min(), rows.max() - p)
+        # The widest margins that leave out pixels which matter, of tiles cut at multiples of 16.
+        needed += [p - rows.min() // 16 * 16 - 15, (rows.max() // 16 + 1) * 16 - 16 - p]
     assert radius - 16 < reached <= radius
+    assert max(needed) == aligned < radius

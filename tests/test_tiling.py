@@ -180,10 +180,10 @@ def test_large_images_in_bands_take_less_memory_each_pixel():
         asked.append(pixels)
         return small if pixels < 2**20 else large
 
-    edge = memory.window_edge(10**9, 288, compiled, guess=guess)
+    edge = memory.window_edge(10**9, 288, 16, compiled, guess=guess)
     assert tried == [edge]
     assert edge >= 1024
-    assert set(asked) == {n * n for n in tiling.window_edges(288)}
+    assert set(asked) == {n * n for n in tiling.window_edges(288, 16)}
 
 
 @pytest.mark.parametrize("name", ["oidn-hdr-alb-nrm", "unet-hdr-alb-nrm-var"])
@@ -237,25 +237,26 @@ def program_of(per_pixel):
 
 def test_a_window_is_as_large_as_the_memory_allows():
     compiled, tried = program_of(1000)
-    edge = memory.window_edge(10**9, 288, compiled, guess=lambda _: 1100)
+    edge = memory.window_edge(10**9, 288, 16, compiled, guess=lambda _: 1100)
     assert tried == [edge]
     assert 0.5 * 10**9 < edge**2 * 1000 * memory.SLACK <= 10**9
     # A guess that is too low costs another compilation, never memory.
     compiled, tried = program_of(5000)
-    assert memory.window_edge(10**9, 288, compiled, guess=lambda _: 1000) < tried[0]
+    assert memory.window_edge(10**9, 288, 16, compiled, guess=lambda _: 1000) < tried[0]
     assert tried[-1] ** 2 * 5000 * memory.SLACK <= 10**9
     compiled, tried = program_of(10**6)
     with pytest.raises(ValueError, match=r"288×288 pixels, takes .* GiB: give at least"):
-        memory.window_edge(10**9, 288, compiled, guess=lambda _: 1000)
+        memory.window_edge(10**9, 288, 16, compiled, guess=lambda _: 1000)
 
 
 def test_a_window_of_a_small_network_is_not_mostly_margin():
     compiled, tried = program_of(1000)
-    edge = memory.window_edge(25 * 10**6, 78, compiled, guess=lambda _: 1000)
+    edge = memory.window_edge(25 * 10**6, 78, 2, compiled, guess=lambda _: 1000)
     assert tried == [edge] == [128]
     for smallest in (8, 64, 78, 100, 300):
-        edges = np.array(tiling.window_edges(smallest))
+        edges = np.array(tiling.window_edges(smallest, 2))
         assert edges[0] == smallest
+        assert not (edges % 2).any()
         after = edges[edges >= 64]
         assert (after[1:] <= 1.26 * after[:-1]).all()
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from progden_jax import _checks
 from progden_jax.combiner.network import KernelNetwork, Params
 from progden_jax.denoisers import Denoiser
-from progden_jax.denoisers._base import Bound, call
+from progden_jax.denoisers._base import Bound, aligned_radius, call
 from progden_jax.denoisers._network import Valid, inside_of
 from progden_jax.frame import Frame
 
@@ -80,6 +80,11 @@ class DeepCombiner:
     def receptive_radius(self) -> int:
         """How many pixels away an output pixel can depend on the input; as far as the denoiser tells."""
         return self.denoiser.receptive_radius + self.network.receptive_radius
+
+    @property
+    def aligned_radius(self) -> int:
+        """The same for a tile that begins and ends at multiples of `alignment`."""
+        return aligned_radius(self.denoiser) + self.network.receptive_radius
 
     @property
     def alignment(self) -> int:

@@ -39,6 +39,11 @@ def call(denoiser: Any, frame: Frame) -> Array:
     return denoiser.bind(frame)(frame.color)
 
 
+def aligned_radius(denoiser: Any) -> int:
+    """How far beyond its core a tile must reach that begins and ends at multiples of the alignment."""
+    return getattr(denoiser, "aligned_radius", denoiser.receptive_radius)
+
+
 class Bounded:
     """A bound denoiser that reaches as far as its ``denoiser`` says."""
 

@@ -124,6 +124,11 @@ class Network:
         return graph.receptive_radius(self.nodes, self.params)
 
     @property
+    def aligned_radius(self) -> int:
+        """The same for a tile that begins and ends at multiples of `alignment`."""
+        return graph.aligned_radius(self.nodes, self.params)
+
+    @property
     def alignment(self) -> int:
         """Pixels after which the way that outputs depend on inputs repeats."""
         return graph.alignment(self.nodes)

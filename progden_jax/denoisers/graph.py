@@ -62,6 +62,7 @@ __all__ = [
     "Relu",
     "Upsample",
     "Weighted",
+    "aligned_radius",
     "alignment",
     "channels",
     "children",
@@ -137,6 +138,46 @@ def receptive_radius(nodes: Sequence[Node], params: Any) -> int:
                 radius = max(reach[s] for s in sources(node))
         reach.append(radius)
     return reach[-1]
+
+
+def aligned_radius(nodes: Sequence[Node], params: Any) -> int:
+    """How far beyond a core tiles must reach that begin and end at multiples of the alignment.
+
+    At most the `receptive_radius`, which also covers how pooled blocks lie to a tile that begins anywhere.
+    """
+    step = alignment(nodes)
+    # From the right of a core it is the same mirrored, for all layers are.
+    short = [begin - _first_read(nodes, params, begin) // step * step for begin in range(step)]
+    # A tile may begin at any multiple up to the one before what is read first.
+    return max(0, *(n - step + 1 for n in short))
+
+
+def _first_read(nodes: Sequence[Node], params: Any, begin: int) -> int:
+    """The first pixel along an axis of what outputs from `begin` on depend on."""
+    first: dict[int, int] = {len(nodes) - 1: begin}
+
+    def read(source: int, at: int) -> None:
+        first[source] = min(first.get(source, at), at)
+
+    for index in reversed(range(len(nodes))):
+        if index not in first:
+            continue
+        node, at = nodes[index], first[index]
+        match node:
+            case Conv():
+                for source in node.sources:
+                    read(source, at - params[node.layer]["kernel"].shape[0] // 2)
+            case MaxPool():
+                read(node.source, 2 * at)
+            case Upsample():
+                read(node.source, at // 2)
+            case Filter():
+                read(node.logits, at)
+                read(node.image, at - node.size // 2)
+            case _:
+                for source in sources(node):
+                    read(source, at)
+    return first[0]
 
 
 def channels(nodes: Sequence[Node], params: Any) -> list[int]:
