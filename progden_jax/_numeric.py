@@ -1,6 +1,7 @@
 """Functions whose derivatives stay finite, or stay cheap; arrays that need no copy."""
 
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +36,6 @@ def aligned_empty(shape: tuple[int, ...]) -> np.ndarray:
     return memory[begin : begin + size].view(np.float32).reshape(shape)
 
 
-def adopted(array: np.ndarray) -> Array:
+def adopted(array: np.ndarray, device: Any = None) -> Array:
     """As a JAX array, in the same memory where that can be; nobody may write to `array` any more."""
-    return jax.device_put(array, may_alias=True)
+    return jax.device_put(array, device, may_alias=True)

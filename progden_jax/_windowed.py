@@ -76,7 +76,7 @@ def within(
         shape = (edge, edge)
     assert shape is not None
     windows = list(tiling.grid(frame.size, shape, reach, step))
-    return assemble(job, frame, divergence, windows, skip, on_host=True, devices=devices)
+    return assemble(job, frame, divergence, windows, skip, grid=True, devices=devices)
 
 
 def assemble(
@@ -86,12 +86,13 @@ def assemble(
     windows: list[Window],
     skip: Skip | None,
     *,
-    on_host: bool = False,
+    grid: bool = False,
     devices: Sequence[Any] | None = None,
 ) -> Any:
     """The windows' cores; what none of them holds is right already.
 
-    With `devices` the windows, of one shape, are computed on all of them at once.
+    `grid`: they cover the whole frame, so that some may be right too, and its images stay on the host. With
+    `devices` the windows, of one shape, are computed on all of them at once.
     """
     whole = survey(frame)
     color = whole.repaired("color")
@@ -104,7 +105,7 @@ def assemble(
     exposure = jax.block_until_ready(exposure_of(color, job.denoiser)) if windows else None
     sums = dict.fromkeys(MEANS, 0.0)
     denoised, computed = 0, 0
-    if skip is not None:
+    if grid and skip is not None:
         windows = [window for window in windows if _is_noisy(whole, window, skip)]
     calls = (_arguments(whole, divergence, exposure, window) for window in windows)
     if devices is None:
@@ -119,7 +120,7 @@ def assemble(
         for name in sums:
             sums[name] += window.core_pixels * float(getattr(found, name, 0.0))
     pixels = color.shape[0] * color.shape[1]
-    given = {n: cast(Any, i) if on_host else jax.numpy.asarray(i) for n, i in images.items()}
+    given = {n: cast(Any, i) if grid else jax.numpy.asarray(i) for n, i in images.items()}
     return job.result(
         given,
         repairs=whole.repairs,

@@ -3,12 +3,14 @@
 import dataclasses
 import functools
 import math
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
+
+from progden_jax._numeric import adopted
 
 MARGIN = 5
 """Pixels around a tile that must be right too: the reach of the t-bound's window."""
@@ -16,8 +18,8 @@ MARGIN = 5
 _MOST_TILES = 128
 """Along an edge, for finding the cheapest windows takes time too."""
 
-_PART = 1 << 14
-"""Pixels."""
+_PART = 1 << 18
+"""Pixels that a compiled program looks at together, one for all larger images."""
 
 
 @jax.tree_util.register_static
@@ -94,16 +96,34 @@ def noisy_tiles(
     Of `canvas` (height, width) where that is given; what it has beyond the image is right.
     """
     height, width = color.shape[:2]
-    # On the host and in parts that stay in the cache: XLA would first copy the whole images.
-    colors, variances = (np.asarray(image).reshape(-1, 3) for image in (color, variance))
+    # On the host, where what follows is.
+    images = [np.asarray(image).reshape(-1, 3) for image in (color, variance)]
     found = np.empty(height * width, bool)
-    with np.errstate(all="ignore"):
+    if len(found) < _PART:
+        with np.errstate(all="ignore"):
+            found[:] = noisy(cast(Any, images[0]), cast(Any, images[1]), skip.tolerance, np)
+    else:
         for begin in range(0, len(found), _PART):
-            part = slice(begin, begin + _PART)
-            found[part] = noisy(colors[part], variances[part], skip.tolerance, np)
+            part = slice(min(begin, len(found) - _PART), begin + _PART)
+            found[part] = _noisy(
+                *(adopted(image[part], _host()) for image in images), skip.tolerance
+            )
     on = np.zeros(canvas or (height, width), bool)
     on[:height, :width] = found.reshape(height, width)
     return np.asarray(_tiles(on, skip.tile))
+
+
+@jax.jit
+def _noisy(color: Array, variance: Array, tolerance: Array) -> Array:
+    return cast(Array, noisy(color, variance, tolerance))
+
+
+@functools.cache
+def _host() -> Any:
+    try:
+        return jax.local_devices(backend="cpu")[0]
+    except RuntimeError:  # JAX_PLATFORMS leaves it out
+        return None
 
 
 @functools.partial(jax.jit, static_argnames="tile")

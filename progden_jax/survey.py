@@ -1,5 +1,6 @@
 """What windows of a frame must know of the whole of it; repairs, on the host and in bands of rows."""
 
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -13,7 +14,9 @@ from progden_jax.frame import Frame, Repairs, repair
 
 BUFFERS = ("color", "variance", "albedo", "normal", "depth")
 
-_BAND = 256
+_BAND = 64
+"""Rows, which stay in the cache for a second look."""
+
 _REPAIR_RADIUS = 2
 """`repair` looks at the 5×5 around a bad pixel."""
 
@@ -83,7 +86,8 @@ def survey(frame: Frame) -> Survey:
     for top in range(0, height, _BAND):
         bottom = min(top + _BAND, height)
         band = {name: buffer[top:bottom] for name, buffer in buffers.items()}
-        if _negative_color(band) or not _sound(band):
+        sums = _sums(band)
+        if sums is None:
             first, last = max(top - _REPAIR_RADIUS, 0), min(bottom + _REPAIR_RADIUS, height)
             around = {name: buffer[first:last] for name, buffer in buffers.items()}
             fixed, _ = _repair(frame_of(around))
@@ -96,9 +100,9 @@ def survey(frame: Frame) -> Survey:
                     values = mended[rows, columns]
                     changes.setdefault(name, []).append(Patches(rows + top, columns, values))
                 band[name] = mended
-        if "variance" in band:
-            noise += float(band["variance"].sum(dtype=np.float64))
-        light += float(np.maximum(band["color"], 0).sum(dtype=np.float64))
+            sums = {name: float(np.maximum(b, 0).sum(dtype=np.float64)) for name, b in band.items()}
+        light += sums["color"]
+        noise += sums.get("variance", 0.0)
     scalar, size = buffers["color"].dtype.type, buffers["color"].size
     repairs = Repairs(*(jnp.asarray(n, jnp.int32) for n in counts))
     patches = {
@@ -108,14 +112,13 @@ def survey(frame: Frame) -> Survey:
     return Survey(buffers, patches, repairs, scalar(noise / size), scalar(light / size))
 
 
-def _negative_color(band: dict[str, np.ndarray]) -> bool:
-    return bool((band["color"] < 0).any())
-
-
-def _sound(band: dict[str, np.ndarray]) -> bool:
-    variance = band.get("variance")
-    finite = all(np.isfinite(buffer).all() for buffer in band.values())
-    return finite and (variance is None or not (variance < 0).any())
+def _sums(band: dict[str, np.ndarray]) -> dict[str, float] | None:
+    """Of each buffer; None where one has a value that may be bad."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        # NumPy sums pairwise. Whatever is not finite shows in the sum.
+        sums = {name: float(buffer.sum()) for name, buffer in band.items()}
+    lowest = [band[name].min() for name in ("color", "variance") if name in band]
+    return sums if all(map(math.isfinite, sums.values())) and min(lowest) >= 0 else None
 
 
 def frame_of(buffers: Mapping[str, Any]) -> Frame:

@@ -115,11 +115,17 @@ def test_noisy_tiles_against_a_plain_loop(tile):
 
 
 def test_a_large_image_is_looked_at_in_parts():
-    color = np.ones((300, 200, 3), np.float32)
+    size = (700, 411)
+    assert skipping._PART < size[0] * size[1] < 2 * skipping._PART
+    color = np.ones((*size, 3), np.float32)
     variance = np.zeros_like(color)
-    variance[299, 199] = 1
+    variance[24, 200] = variance[699, 408] = 1
+    color[:, 56:72] = np.inf
     found = skipping.noisy_tiles(color, variance, pd.Skip())
-    assert list(zip(*np.nonzero(found), strict=True)) == [(18, 12)]
+    rows, columns = np.nonzero(found)
+    beside = np.isin(columns, (3, 4))
+    assert beside.sum() == 2 * found.shape[0]
+    assert list(zip(rows[~beside], columns[~beside], strict=True)) == [(1, 12), (43, 25)]
 
 
 def test_settings_are_checked():
