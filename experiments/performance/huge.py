@@ -83,10 +83,11 @@ def main() -> None:
 
 def write(path: Path, data: Path, names: list[str], spp: int, size: str, noisy: float) -> None:
     """The input."""
-    frame, _ = programs.load_frame(data, names, spp, size_of(size))
-    variance = np.array(frame.variance)
+    color, variance = (
+        programs.mosaic(data, names, spp, buffer, size_of(size)) for buffer in ("color", "variance")
+    )
     variance[int(noisy * len(variance)) :] = 0
-    pd.write_exr(path, pd.Frame(frame.color, variance), spp=spp)
+    pd.write_exr(path, pd.Frame(color, variance), spp=spp)
 
 
 def check(source: Path, target: Path) -> None:

@@ -74,18 +74,21 @@ def load_frame(
     data: Path, names: Sequence[str], spp: int, size: tuple[int, int]
 ) -> tuple[pd.Frame, np.ndarray]:
     """A mosaic of four scenes, mirrored at its borders to (height, width), and its reference."""
-
-    def mosaic(count: int, buffer: str) -> np.ndarray:
-        frames = [pd.read_exr(data / f"{n}_{count:06}spp.exr") for n in (list(names) * 4)[:4]]
-        tiles = [np.asarray(getattr(frame, buffer)) for frame in frames]
-        rows = [np.concatenate(tiles[i : i + 2], axis=1) for i in (0, 2)]
-        whole = np.concatenate(rows, axis=0)
-        border = [(0, max(n - m, 0)) for n, m in zip((*size, 3), whole.shape, strict=True)]
-        return np.pad(whole, border, mode="symmetric")[: size[0], : size[1]]
-
     roles = ("color", "variance", "albedo", "normal")
-    frame = pd.Frame(*(jnp.asarray(mosaic(spp, role)) for role in roles))
-    return frame, mosaic(_common.REFERENCE_SPP, "color")
+    frame = pd.Frame(*(jnp.asarray(mosaic(data, names, spp, role, size)) for role in roles))
+    return frame, mosaic(data, names, _common.REFERENCE_SPP, "color", size)
+
+
+def mosaic(
+    data: Path, names: Sequence[str], spp: int, buffer: str, size: tuple[int, int]
+) -> np.ndarray:
+    """One buffer of that frame."""
+    frames = [pd.read_exr(data / f"{n}_{spp:06}spp.exr") for n in (list(names) * 4)[:4]]
+    tiles = [np.asarray(getattr(frame, buffer)) for frame in frames]
+    rows = [np.concatenate(tiles[i : i + 2], axis=1) for i in (0, 2)]
+    whole = np.concatenate(rows, axis=0)
+    border = [(0, max(n - m, 0)) for n, m in zip((*size, 3), whole.shape, strict=True)]
+    return np.pad(whole, border, mode="symmetric")[: size[0], : size[1]]
 
 
 def has_torch() -> bool:
