@@ -22,7 +22,9 @@ _SPLIT = PartitionSpec(_AXIS)
 
 def cores() -> list[int]:
     """The CPU's that this process may use."""
-    return sorted(os.sched_getaffinity(0))
+    if hasattr(os, "sched_getaffinity"):
+        return sorted(os.sched_getaffinity(0))
+    return list(range(os.cpu_count() or 1))
 
 
 def cores_as_devices(batch: int) -> None:

@@ -560,3 +560,33 @@ def test_damaged_file_prints_nothing_in_a_fresh_process(tmp_path):
     )
     done = subprocess.run([sys.executable, "-c", program, path], capture_output=True, check=True)
     assert (done.stdout, done.stderr) == (b"", b"")
+
+
+@pytest.mark.parametrize("chosen", [0, 3])
+def test_all_cores_decompress_and_a_forked_process_does_not_wait_for_them(tmp_path, chosen):
+    """Of the library's threads a forked process has none, and would wait for them forever."""
+    if not hasattr(OpenEXR, "set_global_thread_count"):
+        pytest.skip("OpenEXR before 3.5 has one thread")
+    path = write(tmp_path / "a.exr", planes("R G B", size=(300, 40)))
+    program = (
+        "import os, sys, OpenEXR, progden_jax.exr as e\n"
+        "path, chosen = sys.argv[1], int(sys.argv[2])\n"
+        "File, counts = OpenEXR.File, []\n"
+        "def noted(*args, **how):\n"
+        "    counts.append(OpenEXR.global_thread_count())\n"
+        "    return File(*args, **how)\n"
+        "OpenEXR.set_global_thread_count(chosen)\n"
+        "OpenEXR.File = noted\n"
+        "color = e.read_exr(path).color\n"
+        "print(max(counts), OpenEXR.global_thread_count())\n"
+        "child = 0 if chosen else os.fork()\n"
+        "if not child:\n"
+        "    e.write_exr(path + '-copy.exr', e.read_layers(path)[''])\n"
+        "    if not chosen: os._exit(0)\n"
+        "else: assert os.waitpid(child, 0)[1] == 0\n"
+        "assert (e.read_layers(path + '-copy.exr')[''] == color).all()"
+    )
+    command = [sys.executable, "-W", "ignore", "-c", program, path, str(chosen)]
+    done = subprocess.run(command, capture_output=True, check=True, timeout=100, text=True)
+    used = chosen or min(len(os.sched_getaffinity(0)), 16)
+    assert done.stdout.split() == [str(used), str(chosen)]

@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 import OpenEXR
 
+from progden_jax._devices import cores
+
 MAGIC = b"\x76\x2f\x31\x01"
 _LISTED = 40
 
@@ -77,7 +79,11 @@ def load(path: str | os.PathLike[str], *, header_only: bool = False) -> list[Par
     with quiet() as printed:
         try:
             headers = _parts(path, header_only=True)
-            parts = headers if header_only else _parts(path, header_only=False)
+            if header_only:
+                parts = headers
+            else:
+                with on_all_cores():
+                    parts = _parts(path, header_only=False)
         except (RuntimeError, ValueError, TypeError, MemoryError) as error:
             reason = printed() or str(error)
             raise ExrError(
@@ -202,6 +208,26 @@ _OTHER_FORMATS = {
 
 def _parts(path: str, *, header_only: bool) -> list[Any]:
     return OpenEXR.File(path, separate_channels=True, header_only=header_only).parts
+
+
+@contextlib.contextmanager
+def on_all_cores() -> Iterator[None]:
+    """Pixels are compressed and decompressed on all cores in this block; the library by itself uses one.
+
+    Only here: a process that is forked has none of the library's threads, and would wait for them forever.
+    By one thread at a time, as under `quiet`. A count that the user has set stays.
+    """
+    if not hasattr(OpenEXR, "set_global_thread_count") or OpenEXR.global_thread_count():
+        yield  # before 3.5, or the user's
+        return
+    OpenEXR.set_global_thread_count(min(len(cores()), _MOST_THREADS))
+    try:
+        yield
+    finally:
+        OpenEXR.set_global_thread_count(0)
+
+
+_MOST_THREADS = 16
 
 
 def _type(header: dict[str, Any]) -> str:

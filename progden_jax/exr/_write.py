@@ -9,7 +9,7 @@ import OpenEXR
 
 from progden_jax._files import replacing
 from progden_jax.exr._channels import alpha_of, find
-from progden_jax.exr._file import ExrError, Part, load, quiet
+from progden_jax.exr._file import ExrError, Part, load, on_all_cores, quiet
 from progden_jax.exr._info import ExrInfo
 from progden_jax.exr._names import Source
 from progden_jax.frame import HALF_MAX, Frame
@@ -216,7 +216,7 @@ def _write(target: str, header: dict[str, Any], channels: dict[str, np.ndarray])
     """The file; `channels` is empty afterwards."""
     try:
         with replacing(target) as beside:
-            with quiet():
+            with quiet(), on_all_cores():
                 OpenEXR.File(header, channels).write(os.fspath(beside))
             names = set(channels)
             channels.clear()  # of a huge image there must not be two copies
