@@ -96,6 +96,12 @@ def trim() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
+def release() -> None:
+    """Give back what JAX has adopted and nobody holds: it lets go only when it is next called."""
+    for _ in range(2):  # a view of an array of its own, and then that array
+        jax.device_put(0)
+
+
 def trim_for(pixels: int) -> None:
     """Before an image of so many is computed: `trim` if it is large, now and after each compilation.
 

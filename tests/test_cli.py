@@ -8,6 +8,7 @@ import re
 import resource
 import subprocess
 import sys
+import weakref
 from pathlib import Path
 
 import jax
@@ -18,7 +19,7 @@ from code_generation import users_environment
 from exr_files import planes, read_channels, stack, write
 
 import progden_jax as pd
-from progden_jax import _amx, demo, memory, pipeline
+from progden_jax import _amx, _numeric, _windowed, demo, memory, pipeline
 from progden_jax.cli import _options, _run, app, main
 from progden_jax.exr import read_exr, write_exr
 
@@ -111,6 +112,29 @@ def put(where, value):
 
 
 # One file, many, a folder.
+
+
+def test_the_frame_is_gone_while_the_result_is_written(noisy, tmp_path, progden, monkeypatch):
+    """In windows, as a huge one is, where three images at once could be more than `--max-memory`."""
+    read = importlib.import_module("progden_jax.exr._read")
+    job = importlib.import_module("progden_jax.cli._job")
+    buffers, alive = [], []
+
+    def adopted(array):
+        buffers.append(weakref.ref(array.base))
+        return _numeric.adopted(array)
+
+    def writing(*arguments, **settings):
+        alive.extend(buffer() is not None for buffer in buffers)
+        return write_exr(*arguments, **settings)
+
+    monkeypatch.setattr(read, "adopted", adopted)
+    monkeypatch.setattr(job, "write_exr", writing)
+    monkeypatch.setattr(_windowed, "fits", lambda *_: False)
+    monkeypatch.setattr(memory, "resident", lambda: 0)
+    more = ["--max-memory", "1GiB", *QUICK]
+    assert progden("denoise", noisy, "-o", tmp_path / "out.exr", *more)[0] == 0
+    assert alive == [False] * 5
 
 
 def test_one_file_becomes_the_librarys_result(tmp_path, noisy, frames, progden):

@@ -167,6 +167,7 @@ def process(item: Item, settings: Settings, outcome: Outcome, progress: Progress
         outcome.metrics = _measure(images, frame, reference)
     picture, layers = _chosen(images, frame, settings.save, outcome)
     del images, frame  # while a huge image is written, no other is held
+    memory.release()
     outcome.notes += write_exr(
         item.output,
         picture,
