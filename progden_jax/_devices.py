@@ -21,7 +21,7 @@ _SPLIT = PartitionSpec(_AXIS)
 
 
 def cores() -> list[int]:
-    """The CPU's that this process may use."""
+    """The CPUs that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return sorted(os.sched_getaffinity(0))
     return list(range(os.cpu_count() or 1))

@@ -17,6 +17,8 @@ BUFFERS = ("color", "variance", "albedo", "normal", "depth")
 _BAND = 64
 """Rows, which stay in the cache for a second look."""
 
+_NOT_NEGATIVE = ("color", "variance")
+
 _REPAIR_RADIUS = 2
 """`repair` looks at the 5×5 around a bad pixel."""
 
@@ -100,7 +102,8 @@ def survey(frame: Frame) -> Survey:
                     values = mended[rows, columns]
                     changes.setdefault(name, []).append(Patches(rows + top, columns, values))
                 band[name] = mended
-            sums = {name: float(np.maximum(b, 0).sum(dtype=np.float64)) for name, b in band.items()}
+            lit = {name: np.maximum(band[name], 0) for name in _NOT_NEGATIVE if name in band}
+            sums = {name: float(values.sum(dtype=np.float64)) for name, values in lit.items()}
         light += sums["color"]
         noise += sums.get("variance", 0.0)
     scalar, size = buffers["color"].dtype.type, buffers["color"].size
@@ -117,7 +120,7 @@ def _sums(band: dict[str, np.ndarray]) -> dict[str, float] | None:
     with np.errstate(over="ignore", invalid="ignore"):
         # NumPy sums pairwise. Whatever is not finite shows in the sum.
         sums = {name: float(buffer.sum()) for name, buffer in band.items()}
-    lowest = [band[name].min() for name in ("color", "variance") if name in band]
+    lowest = [band[name].min() for name in _NOT_NEGATIVE if name in band]
     return sums if all(map(math.isfinite, sums.values())) and min(lowest) >= 0 else None
 
 
